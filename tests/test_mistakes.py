@@ -364,6 +364,18 @@ MISTAKES = {
         lambda: jr.plot.polhode(STATE, MOMENTS),
         "`body` must have or be an inertia, but it is a State",
     ),
+    "a seed for a random key": (
+        lambda: jr.identify.block_bootstrap(
+            np.ones((9, 1, 1)), np.ones((9, 1)), 3, key=0
+        ),
+        r"`key` must be a random key, such as `jax.random.key\(0\)`, but it is a int",
+    ),
+    "a matrix for the derivatives of each time": (
+        lambda: jr.identify.block_bootstrap(
+            np.ones((9, 1)), np.ones((9, 1)), 3, key=jax.random.key(0)
+        ),
+        r"`jacobian` must have shape \(n, n, n\), but it has shape \(9, 1\)",
+    ),
     "no zarr": (
         lambda: without(
             "zarr", lambda: jr.sweep(lambda a: a, {"a": TS}, store="none.zarr")

@@ -171,6 +171,8 @@ def test_bad_arguments_are_named(scene, untyped):
         ValueError, match="`optimizer` must be a GradientTransformation"
     ):
         identify.train(body, scene.trials, "adam", key=key)
+    with pytest.raises(ValueError, match="`key` must be a random key"):
+        identify.train(body, scene.trials, ADAM, key=0)
     with pytest.raises(ValueError, match="`system` must be a RigidBody"):
         identify.train(scene.tensor, scene.trials, ADAM, key=key)
     upright = jr.torques.MagneticDipole(np.ones(3), np.ones(3))

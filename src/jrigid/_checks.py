@@ -274,6 +274,19 @@ def check_type(name: str, value: object, *types: type) -> None:
         )
 
 
+def check_key(name: str, value: Any) -> None:
+    """Raise ValueError unless `value` is one random key, of either kind of JAX."""
+    is_key = isinstance(value, jax.Array) and (
+        jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+        or (value.dtype == jnp.uint32 and value.ndim == 1)
+    )
+    demand(
+        is_key,
+        f"Argument `{name}` must be a random key, such as `jax.random.key(0)`, but it "
+        f"is {kind_of(value)}.",
+    )
+
+
 def kind_of(value: Any) -> str:
     """The kind of a wrong argument, in words."""
     if isinstance(value, type):

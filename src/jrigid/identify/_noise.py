@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import demand
+from jrigid._checks import array_of_shape, check_key, check_shape, demand, shaped
 from jrigid._numerics import product
 from jrigid._types import RandomKey
 
@@ -40,10 +40,14 @@ def coloured_covariance(
         Covariance of the parameters, `A B B^T A^T`, with A the pseudo-inverse of the
         Jacobian.
 
+    Raises:
+        ValueError: A `jacobian` that is no matrix.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> print(jr.identify.coloured_covariance(jnp.ones((4, 1)), lambda row: 2 * row))
     [[1.]]
     """
+    jacobian = array_of_shape("jacobian", jacobian, None, None)
     # With A the influence, B^T times a row of A is a row of A B.
     root = jax.vmap(colour)(_influence(jacobian))
     return product("ik,jk->ij", root, root)
@@ -75,8 +79,8 @@ def block_bootstrap(
         Shifts of the parameters. Their standard deviation estimates the standard error.
 
     Raises:
-        ValueError: The block is as long as the record, which could be drawn in one way
-            only.
+        ValueError: Shapes that do not fit each other, no random key, or a block as long
+            as the record, which could be drawn in one way only.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> jacobian = jnp.ones((50, 1, 1))
@@ -85,7 +89,12 @@ def block_bootstrap(
     >>> print(shifts.shape)
     (1000, 1)
     """
+    check_key("key", key)
+    jacobian, residuals = shaped(
+        jacobian=(jacobian, None, None, None), residuals=(residuals, None, None)
+    )
     times, outputs, params = jacobian.shape
+    check_shape("residuals", residuals, (times, outputs))
     demand(
         1 <= block < times,
         f"Argument `block` must be at least 1 and less than {times}, but it is "

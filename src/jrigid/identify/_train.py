@@ -13,7 +13,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._checks import all_finite, check_type, demand, whole_number
+from jrigid._checks import all_finite, check_key, check_type, demand, whole_number
 from jrigid._numerics import product
 from jrigid._stepping.method import method_of
 from jrigid._types import AnyArray, RandomKey
@@ -187,6 +187,7 @@ def train(
 
     check_type("system", system, RigidBody)
     check_type("optimizer", optimizer, optax.GradientTransformation)
+    check_key("key", key)
     whole_number("segment", segment)
     whole_number("batch", batch)
     whole_number("patience", patience)
