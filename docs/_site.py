@@ -23,11 +23,11 @@ API, THUMBNAILS = ROOT / "docs" / "api", ROOT / "docs" / "thumbnails"
 EXECUTED = ROOT / "outputs" / "notebooks"
 MODULES = {
     f"jrigid.{name}": module
-    for name, module in sorted(vars(jrigid).items())
+    for name, module in inspect.getmembers(jrigid)
     if inspect.ismodule(module) and hasattr(module, "__all__")
 }
 TOP = sorted(
-    k for k, x in vars(jrigid).items() if k[0] != "_" and not inspect.ismodule(x)
+    k for k, x in inspect.getmembers(jrigid) if k[0] != "_" and not inspect.ismodule(x)
 )
 
 

@@ -7,7 +7,11 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 with install_import_hook("jrigid", "beartype.beartype"):
-    import jrigid  # noqa: F401
+    import jrigid
+
+    # Packages that are imported at their first use are checked as well.
+    for name in jrigid.__all__:
+        getattr(jrigid, name)
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402

@@ -114,7 +114,7 @@ def public_modules():
     """Public modules by their names."""
     return {
         name: module
-        for name, module in sorted(vars(jrigid).items())
+        for name, module in inspect.getmembers(jrigid)
         if inspect.ismodule(module) and hasattr(module, "__all__")
     }
 

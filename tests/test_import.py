@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-LARGEST = 0.5  # processor time of the import, over that of its dependencies
+LARGEST = 0.3  # processor time of the import, over that of its dependencies
 LOOK = """
 import sys, time
 start = time.process_time()
@@ -52,3 +52,25 @@ def test_the_import_takes_a_fraction_of_that_of_its_dependencies(imported):
     """The ratio of the processor times is the same on an idle and on a busy machine."""
     _, took = imported
     assert took < LARGEST
+
+
+def test_packages_are_imported_when_they_are_used():
+    """As attributes, by `from`, by a star, and once."""
+    code = """
+import sys, jrigid
+late = jrigid._LATE
+assert set(late) <= set(dir(jrigid))
+assert not any("jrigid." + x in sys.modules for x in late), late
+from jrigid import plot
+assert plot is jrigid.plot is sys.modules["jrigid.plot"]
+assert "polhode" in dir(plot) and "annotations" not in dir(plot)
+from jrigid import *
+assert identify.fit is jrigid.identify.fit
+try:
+    jrigid.simulat
+except AttributeError as error:
+    assert "simulat" in str(error)
+else:
+    raise AssertionError
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)

@@ -23,7 +23,7 @@ seen = pytest.mark.skipif(PROGRAM is None, reason="no chromium on this machine")
 
 MODULES = {
     f"jrigid.{name}": module
-    for name, module in vars(jr).items()
+    for name, module in inspect.getmembers(jr)
     if inspect.ismodule(module) and hasattr(module, "__all__")
 }
 NAMES = {
@@ -33,7 +33,7 @@ NAMES = {
 }
 TOP = {
     f"jrigid.{k}": x
-    for k, x in vars(jr).items()
+    for k, x in inspect.getmembers(jr)
     if not k.startswith("_") and not inspect.ismodule(x)
 }
 ALL = NAMES | TOP

@@ -1,27 +1,23 @@
 """jrigid: the rotation of rigid bodies in JAX."""
 
+from importlib import import_module as _import_module
 from importlib.metadata import version as _version
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 from jrigid import datasets as datasets
 from jrigid import dynamics as dynamics
 from jrigid import elliptic as elliptic
 from jrigid import free as free
-from jrigid import identify as identify
-from jrigid import io as io
 from jrigid import lagrangian as lagrangian
 from jrigid import mass as mass
-from jrigid import photometry as photometry
-from jrigid import plot as plot
-from jrigid import records as records
 from jrigid import rotation as rotation
 from jrigid import solids as solids
 from jrigid import solvers as solvers
-from jrigid import stability as stability
 from jrigid import systems as systems
 from jrigid import top as top
 from jrigid import torques as torques
 from jrigid._checks import RESULTS as RESULTS
-from jrigid._public import list_public_names as _list_public_names
 from jrigid.dynamics import ExactStates as ExactStates
 from jrigid.dynamics import State as State
 from jrigid.dynamics import angular_momentum as angular_momentum
@@ -52,23 +48,25 @@ from jrigid.top import top_motion as top_motion
 
 __version__ = _version("jrigid")
 
-_list_public_names(
-    datasets,
-    dynamics,
-    elliptic,
-    free,
-    identify,
-    io,
-    lagrangian,
-    mass,
-    photometry,
-    plot,
-    records,
-    rotation,
-    solids,
-    solvers,
-    stability,
-    systems,
-    top,
-    torques,
-)
+# These are imported when they are first used: they take two thirds of the time.
+_LATE = ("identify", "io", "photometry", "plot", "records", "stability")
+if _TYPE_CHECKING:
+    from jrigid import identify as identify
+    from jrigid import io as io
+    from jrigid import photometry as photometry
+    from jrigid import plot as plot
+    from jrigid import records as records
+    from jrigid import stability as stability
+else:
+    # To a type checker such a function would make every name valid.
+    def __getattr__(name: str) -> _Any:
+        """Import a package at its first use."""
+        if name in _LATE:
+            return _import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        """All names, those of packages that are not imported yet among them."""
+        return sorted({*globals(), *_LATE})
+
+    globals()["__all__"] = [name for name in __dir__() if not name.startswith("_")]

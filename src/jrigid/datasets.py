@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from jrigid._extra import extra
+from jrigid._public import list_public_names
 from jrigid._types import Readable
 
 _DEGREE = math.pi / 180.0
@@ -212,3 +213,6 @@ def _tumble(
         omega = omega + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         omegas.append(omega)
     return np.stack(omegas[::10])
+
+
+list_public_names(__name__)

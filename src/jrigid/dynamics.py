@@ -15,6 +15,7 @@ from jrigid._checks import (
     shaped,
     state_array,
 )
+from jrigid._public import list_public_names
 from jrigid._types import InertiaLike, Readable, Scalar, Vector, VectorLike
 
 
@@ -230,3 +231,6 @@ def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
     [ 1. -2.  1.]
     """
     return -_momentum_cross_omega(*_inertia_and_vector(inertia, omega))
+
+
+list_public_names(__name__)

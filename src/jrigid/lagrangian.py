@@ -25,6 +25,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._numerics import power_of_two, product
+from jrigid._public import list_public_names
 from jrigid._types import Real, Scalar, TimeLike
 
 Lagrangian: TypeAlias = Callable[..., Any]
@@ -366,3 +367,6 @@ def _is_flat(
     largest = jnp.maximum(jnp.max(change), jnp.max(jnp.abs(momentum * q_dot)))
     tolerance = _ROUNDING_ERRORS * float(jnp.finfo(q.dtype).eps)
     return (change <= tolerance * largest) & jnp.isfinite(value)
+
+
+list_public_names(__name__)

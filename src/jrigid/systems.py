@@ -25,6 +25,7 @@ from jrigid._checks import (
     state_array,
     traced_by_jax,
 )
+from jrigid._public import list_public_names
 from jrigid._types import (
     BodyState,
     InertiaLike,
@@ -468,3 +469,6 @@ class FloatingBody(AbstractSystem):
         """
         orbital = jnp.cross(state.position, self.momentum(state))
         return orbital + self.rotation.angular_momentum(t, state, args)
+
+
+list_public_names(__name__)

@@ -8,6 +8,7 @@ length, and every derivative, of any order and in any mode, is a closed form or 
 a loop of positive terms.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.elliptic._carlson import rc as rc
 from jrigid.elliptic._carlson import rd as rd
 from jrigid.elliptic._carlson import rf as rf
@@ -21,3 +22,5 @@ from jrigid.elliptic._legendre import ellipk as ellipk
 from jrigid.elliptic._legendre import ellipkinc as ellipkinc
 from jrigid.elliptic._legendre import ellippi as ellippi
 from jrigid.elliptic._legendre import ellippiinc as ellippiinc
+
+_list_public_names(__name__)

@@ -1,5 +1,6 @@
 """Free rotation: the exact flow, its periods, curves and cones."""
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.free._curves import Poinsot as Poinsot
 from jrigid.free._curves import Separatrix as Separatrix
 from jrigid.free._curves import herpolhode as herpolhode
@@ -20,3 +21,5 @@ from jrigid.free._symmetric import ConeAngles as ConeAngles
 from jrigid.free._symmetric import cone_angles as cone_angles
 from jrigid.free._symmetric import precession_rate as precession_rate
 from jrigid.free._symmetric import wobble_rate as wobble_rate
+
+_list_public_names(__name__)

@@ -1,5 +1,6 @@
 """Inertia from what was observed: the fit, what it can tell, its numbers and its linear starts."""
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.identify._compare import Comparison as Comparison
 from jrigid.identify._compare import compare as compare
 from jrigid.identify._compare import cross_validate as cross_validate
@@ -59,3 +60,5 @@ from jrigid.identify._train import TrainResult as TrainResult
 from jrigid.identify._train import train as train
 from jrigid.identify._unknowns import each as each
 from jrigid.identify._unknowns import prior as prior
+
+_list_public_names(__name__)

@@ -5,6 +5,7 @@ space, and tensors about the centre of mass. Each function states the convention
 other package. The packages are the extra `jrigid[io]`.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.io._attitudes import from_jaxlie as from_jaxlie
 from jrigid.io._attitudes import from_mrp as from_mrp
 from jrigid.io._attitudes import from_scipy as from_scipy
@@ -23,3 +24,5 @@ from jrigid.io._physical import diagnose as diagnose
 from jrigid.io._physical import nearest_physical as nearest_physical
 from jrigid.io._tables import to_pandas as to_pandas
 from jrigid.io._tables import to_xarray as to_xarray
+
+_list_public_names(__name__)

@@ -6,6 +6,7 @@ derivatives of their symmetric functions are right to first order through
 `principal_axes`, and to second order through `tensor_function`.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.mass._axes import inertia_of_second_moment as inertia_of_second_moment
 from jrigid.mass._axes import parallel_axis as parallel_axis
 from jrigid.mass._axes import principal_axes as principal_axes
@@ -18,3 +19,5 @@ from jrigid.mass._mesh import from_mesh as from_mesh
 from jrigid.mass._points import from_density as from_density
 from jrigid.mass._points import from_points as from_points
 from jrigid.mass._points import inertia_tensor as inertia_tensor
+
+_list_public_names(__name__)

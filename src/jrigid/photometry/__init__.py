@@ -11,6 +11,7 @@ body axes where a shape alone is. Bodies are convex: nothing here casts a shadow
 pole, the period and the convex shape of a body that rotates steadily.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.photometry._alcdef import read_alcdef as read_alcdef
 from jrigid.photometry._alias import Alias as Alias
 from jrigid.photometry._alias import Estimates as Estimates
@@ -53,3 +54,5 @@ from jrigid.photometry._tumbling import Tumbling as Tumbling
 from jrigid.photometry._tumbling import omega_from_energy as omega_from_energy
 from jrigid.photometry._tumbling import omega_from_periods as omega_from_periods
 from jrigid.photometry._tumbling import tumbling as tumbling
+
+_list_public_names(__name__)

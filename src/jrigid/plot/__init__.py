@@ -10,6 +10,7 @@ sphere are faint. `animate` and `animate_light_curve` return an `Animation`, to 
 a notebook or to save. Matplotlib is imported when the first picture is drawn.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.plot._animate import Animation as Animation
 from jrigid.plot._animate import animate as animate
 from jrigid.plot._animate import animate_light_curve as animate_light_curve
@@ -24,3 +25,5 @@ from jrigid.plot._light import period_map as period_map
 from jrigid.plot._motion import motion as motion
 from jrigid.plot._top import effective_potential as effective_potential
 from jrigid.plot._top import tip as tip
+
+_list_public_names(__name__)

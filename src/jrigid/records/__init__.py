@@ -3,6 +3,7 @@
 What is recognised, converted or repaired is said in the notes of a `Reading`.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.records._clock import Clock as Clock
 from jrigid.records._clock import repair as repair
 from jrigid.records._flights import flights as flights
@@ -13,3 +14,5 @@ from jrigid.records._reading import Reading as Reading
 from jrigid.records._reading import allan as allan
 from jrigid.records._reading import noise as noise
 from jrigid.records._reading import rests as rests
+
+_list_public_names(__name__)

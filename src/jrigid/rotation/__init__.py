@@ -5,6 +5,7 @@ to space components: `v_space = R(q) v_body`. `omega` is the angular velocity in
 components [rad/s], `hat(omega) = R^T R'`. q and -q are the same attitude.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.rotation._forms import from_euler as from_euler
 from jrigid.rotation._forms import from_matrix as from_matrix
 from jrigid.rotation._forms import from_roll_pitch_yaw as from_roll_pitch_yaw
@@ -33,3 +34,5 @@ from jrigid.rotation._rates import attitude_rate as attitude_rate
 from jrigid.rotation._rates import euler_rates_to_omega as euler_rates_to_omega
 from jrigid.rotation._rates import integrate_rate as integrate_rate
 from jrigid.rotation._rates import omega_to_euler_rates as omega_to_euler_rates
+
+_list_public_names(__name__)

@@ -10,6 +10,7 @@ Source: Beer, Johnston, Mazurek and Cornwell, Vector Mechanics for Engineers: Dy
 10th ed., 9.11-9.17 and inside cover; torus and capsule by integration.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.solids._round import capsule as capsule
 from jrigid.solids._round import cone as cone
 from jrigid.solids._round import cylinder as cylinder
@@ -24,3 +25,5 @@ from jrigid.solids._straight import box as box
 from jrigid.solids._straight import lamina as lamina
 from jrigid.solids._straight import rod as rod
 from jrigid.solids._straight import tetrahedron as tetrahedron
+
+_list_public_names(__name__)

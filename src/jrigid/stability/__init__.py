@@ -1,5 +1,6 @@
 """Stability: growth rates, linearisation, maps, chaos, sections, final spin."""
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.stability._closed import REGIONS as REGIONS
 from jrigid.stability._closed import Modes as Modes
 from jrigid.stability._closed import PrecessionStability as PrecessionStability
@@ -30,3 +31,5 @@ from jrigid.stability._maps import boundary as boundary
 from jrigid.stability._maps import stability_map as stability_map
 from jrigid.stability._section import Section as Section
 from jrigid.stability._section import poincare_section as poincare_section
+
+_list_public_names(__name__)

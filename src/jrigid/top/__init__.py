@@ -1,5 +1,6 @@
 """The heavy top: Lagrange's in closed form, its nutation and special motions."""
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.top._integrals import Integrals as Integrals
 from jrigid.top._integrals import integrals as integrals
 from jrigid.top._nutation import CLASSES as CLASSES
@@ -26,3 +27,5 @@ from jrigid.top._special import sleeping_spin as sleeping_spin
 from jrigid.top._special import steady_precession as steady_precession
 from jrigid.top._symmetric_top import SymmetricTop as SymmetricTop
 from jrigid.top._top_motion import top_motion as top_motion
+
+_list_public_names(__name__)

@@ -7,6 +7,7 @@ error when the torque is built, if its value is known then. `simulate` and other
 functions that integrate check all parameters.
 """
 
+from jrigid._public import list_public_names as _list_public_names
 from jrigid.torques._base import AbstractTorque as AbstractTorque
 from jrigid.torques._base import Constant as Constant
 from jrigid.torques._base import Sum as Sum
@@ -25,3 +26,5 @@ from jrigid.torques._internal import Rotor as Rotor
 from jrigid.torques._internal import SpinningMass as SpinningMass
 from jrigid.torques._orbit import KeplerOrbit as KeplerOrbit
 from jrigid.torques._sampled import Sampled as Sampled
+
+_list_public_names(__name__)
