@@ -1,6 +1,7 @@
 """ALCDEF files and Kepler orbits: known geometry, light time, and errors by line."""
 
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -195,6 +196,17 @@ def test_errors_name_the_file_and_the_line(tmp_path, lines, line, words):
     assert len(str(e.value)) < 200
 
 
+def test_several_objects_are_refused(tmp_path):
+    eros = block([("2457100.5", "15.0")], OBJECTNUMBER="433")
+    # A number is not known at first.
+    first = block([("2457100.4", "15.0")], OBJECTNUMBER="0")
+    lines = [*first, *eros, *eros]
+    assert len(ph.read_alcdef(write(tmp_path, lines), linear)) == 3
+    other = block([("2457100.6", "15.0")], OBJECTNUMBER="99942")
+    with pytest.raises(ValueError, match="the object is 99942, but that of sessions"):
+        ph.read_alcdef(write(tmp_path, [*lines, *other]), linear)
+
+
 def test_positions_must_be_vectors(tmp_path):
     path = write(tmp_path, GOOD)
 
@@ -373,11 +385,13 @@ def test_an_observer_is_away_from_the_centre_of_the_earth():
     days = J2000 + np.arange(-2.0, 3.0)
     body = sky("heliocentriceclipticiau76", np.full((5, 3), AU), days, scale="utc")
     site = coordinates.EarthLocation.from_geocentric(6.4e6, 0, 0, units.m)
-    from_site = ph.geometry_of_coordinates(body, site.get_itrs(body.obstime))
+    from_site = ph.geometry_of_coordinates(body, site)
+    again = ph.geometry_of_coordinates(body, site.get_itrs(body.obstime))
     # The dates of the table are those of TDB.
     dates = body.obstime.tdb.jd
     from_centre = ph.geometry_of_coordinates(body)
     offset = (from_site(dates)[1] - from_centre(dates)[1])[2]
+    np.testing.assert_array_equal(from_site(dates)[1], again(dates)[1])
     x, y, z = offset
     obliquity = np.radians(84381.448 / 3600)
     ascension = np.arctan2(np.cos(obliquity) * y - np.sin(obliquity) * z, x)
@@ -411,6 +425,41 @@ def test_times_of_another_scale_keep_their_digits(tmp_path):
     path = write(tmp_path, block(rows, LTCAPP="POINT"))
     (curve,) = ph.read_alcdef(path, linear, time_scale="tai")
     np.testing.assert_allclose(curve.ts, [0, 1e-10 * DAY], rtol=1e-4)
+
+
+def test_nothing_is_downloaded(monkeypatch):
+    """Not even where the tables of the Earth's rotation are old."""
+    coordinates = pytest.importorskip("astropy.coordinates")
+    iers = pytest.importorskip("astropy.utils.iers.iers")
+    monkeypatch.setattr(iers.conf, "auto_download", True)
+    # So old that all tables are.
+    monkeypatch.setattr(iers.conf, "auto_max_age", 10)
+    asked = []
+
+    def download(*arguments, **options):
+        asked.append(arguments)
+        raise OSError
+
+    monkeypatch.setattr(iers, "download_file", download)
+    days = 2461380.5 + np.arange(5.0)
+    body = sky("gcrs", np.full((5, 3), AU), days)
+    site = coordinates.EarthLocation.from_geodetic(10.0, 50.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        to_sun, _ = ph.geometry_of_coordinates(body, site)(days)
+    assert np.all(np.isfinite(to_sun))
+    assert not asked
+
+
+def test_dates_may_be_one_number_or_a_list(untyped):
+    days = J2000 + np.arange(5.0)
+    orbit = ph.geometry_of_orbit(ORBIT)
+    for positions in (orbit, ph.geometry_of_table(days, *orbit(days))):
+        expected = positions(days[1:2])
+        for dates in (float(days[1]), [days[1]]):
+            np.testing.assert_array_equal(positions(dates), expected)
+    assert ph.earth_position([J2000, J2000 + 1]).shape == (2, 3)
+    assert ORBIT.position([J2000]).shape == (1, 3)
 
 
 def test_mistakes_with_coordinates_are_named(tmp_path):

@@ -218,14 +218,27 @@ def test_a_report_says_which_tumblers_explain_the_curves(inversion):
     assert "P_psi" in report
 
 
+def shuffled(curve):
+    """The same curve with its points in another order."""
+    order = np.random.default_rng(1).permutation(len(curve.ts))
+    fields = ("ts", "brightness", "to_sun", "to_observer")
+    return dataclasses.replace(
+        curve, **{name: getattr(curve, name)[order] for name in fields}
+    )
+
+
 def test_a_noise_that_is_not_stated_does_not_hide_a_light_curve_that_is_missed(
     inversion,
 ):
-    """The noise that is found holds the misfit, so that chi-square cannot tell."""
+    """The noise that is found holds the misfit, so that chi-square cannot tell.
+
+    Neighbours are those in time, whatever the order of the points.
+    """
     curves, _, found = inversion
     assert abs(found.correlation) < 0.2
+    assert "found from what the fit leaves" not in found.report()
     wrong = ph.find_tumblers(
-        curves,
+        [shuffled(x) for x in curves],
         shortest=8 * HOUR,
         longest=400 * HOUR,
         modes=["principal-axis"],
@@ -237,6 +250,7 @@ def test_a_noise_that_is_not_stated_does_not_hide_a_light_curve_that_is_missed(
     assert not wrong.follows
     assert not wrong.determined
     assert wrong.report().startswith("No tumbler was found")
+    assert "found from what the fit leaves" in wrong.report()
 
 
 @pytest.mark.parametrize("mode", ["short-axis", "long-axis"])
@@ -490,6 +504,8 @@ def test_mistakes_in_an_inversion_say_what_to_pass():
         ph.period_pairs([curve], 40.0, 80.0)
     with pytest.raises(ValueError, match="`noise` must be positive"):
         ph.find_tumblers([curve], 0.0, shortest=1.0, longest=2.0)
+    with pytest.raises(ValueError, match="`threshold` must not be negative"):
+        ph.find_tumblers([curve], shortest=1.0, longest=2.0, threshold=-1.0)
     with pytest.raises(ValueError, match="`modes` must name a motion"):
         ph.find_tumblers([curve], shortest=1.0, longest=2.0, modes=[])
     with pytest.raises(ValueError, match="`modes` must be"):
@@ -497,6 +513,9 @@ def test_mistakes_in_an_inversion_say_what_to_pass():
     dark = ph.LightCurve(0.0, np.arange(20.0), np.zeros(20), far, far, is_relative=True)
     with pytest.raises(ValueError, match="positive brightness"):
         ph.find_tumblers([dark], shortest=1.0, longest=2.0)
+    magnitudes = dataclasses.replace(curve, brightness=np.linspace(15.0, 15.5, 20))
+    with pytest.raises(ValueError, match=r"its mean is 15.25: take 10\^\(-0.4 m\)"):
+        ph.find_tumblers([magnitudes], 0.02, shortest=1.0, longest=2.0)
     few = ph.LightCurve(0.0, np.arange(5.0), np.ones(5), far[:5], far[:5], True)
     with pytest.raises(ValueError, match="at least 12 points"):
         ph.find_tumblers([few], shortest=1.0, longest=2.0)

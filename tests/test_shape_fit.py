@@ -174,6 +174,22 @@ def test_a_fit_may_start_from_facets(relative):
     np.testing.assert_allclose(again.chi_square, found.chi_square, rtol=1e-3)
 
 
+def test_a_noise_that_is_not_stated_does_not_hide_a_misfit(relative):
+    curves, found = relative
+    assert found.follows
+    assert abs(found.correlation) < 0.3
+    start = found.tumbler
+    slower = dataclasses.replace(
+        start,
+        precession_period=1.02 * start.precession_period,
+        rotation_period=1.02 * start.rotation_period,
+    )
+    wrong = ph.fit_shape(curves, slower, epoch=found.epoch, **SMALL)
+    assert wrong.noise > 5 * NOISE
+    assert not wrong.follows
+    assert "correlates by" in wrong.report()
+
+
 def test_mistakes_say_what_to_pass(relative):
     curves, _ = relative
     steady = dataclasses.replace(start_of("short-axis"), mode="principal-axis")

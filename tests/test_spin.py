@@ -238,10 +238,22 @@ def test_a_tumbler_is_refused_by_its_misfit():
     assert "No steady rotation was found" in result.report()
 
 
+@pytest.mark.parametrize(("factor", "follows"), [(1.0, True), (1.03, False)])
+def test_a_noise_that_is_not_stated_does_not_hide_a_misfit(factor, follows):
+    period = factor * PERIOD
+    result = ph.find_spin(
+        observed(0.01, True, 0.2), shortest=period, longest=period, **SMALL
+    )
+    assert result.follows == follows
+    assert (result.correlation > 0.3) != follows
+    assert "found from what the fit leaves" in result.report()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"curves": []}, "must hold a light curve, but it is empty"),
+        ({"threshold": -1.0}, "`threshold` must not be negative"),
         ({"noise": 0.0}, "`noise` must be positive or None"),
         ({"shortest": 8.0 * HOUR}, "must be periods in seconds in rising order"),
         ({"shortest": 60.0}, "trial periods, more than 50000: narrow the range"),
@@ -259,6 +271,13 @@ def test_malformed_arguments_say_what_to_pass(changes, message):
     arguments = {"curves": observed(0.01, True, 0.0, nights=3), "noise": 0.01, **RANGE}
     with pytest.raises(ValueError, match=message):
         ph.find_spin(**(arguments | changes))
+
+
+def test_a_single_curve_is_told_from_a_list(untyped):
+    (curve,) = observed(0.01, True, 0.0, nights=1)
+    for search in (ph.find_spin, ph.find_tumblers):
+        with pytest.raises(ValueError, match="must be a list of light curves"):
+            search(curve, 0.01, **RANGE)
 
 
 def test_too_few_points_are_refused():

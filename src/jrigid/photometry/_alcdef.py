@@ -48,7 +48,7 @@ class _Parser:
         # A byte of another encoding, in a name say, must not make the data unreadable.
         text = self.path.read_text(encoding="utf-8-sig", errors="replace")
         for self.line, line in enumerate(text.splitlines(), 1):
-            if line.strip() and not line.startswith("#"):
+            if line.strip() and not line.strip().startswith("#"):
                 self._read(line)
         if self.session is not None:
             raise self.error(
@@ -203,7 +203,7 @@ def read_alcdef(
 
     Raises:
         ValueError: A line that does not hold what it should, with the file and the line;
-            positions that are not vectors; or another `time_scale`.
+            several objects; positions that are not vectors; or another `time_scale`.
         ImportError: Another scale than "tdb" without the extra `jrigid[photometry]`.
 
     Source: ALCDEF, Definition and standards, v. 2.2.7 (alcdef.org).
@@ -225,6 +225,7 @@ def read_alcdef(
         f"{time_scale!r}.",
     )
     parser = _Parser(path)
+    _check_one_object(parser)
     if time_scale != TDB:
         for session in parser.sessions:
             session.dates = in_tdb(session.dates, time_scale)
@@ -233,6 +234,23 @@ def read_alcdef(
         # `repr` gives the digits that were typed, not those of the binary fraction.
         zero = Decimal(repr(float(epoch)))
     return [_curve(parser, session, positions, zero) for session in parser.sessions]
+
+
+def _check_one_object(parser: _Parser) -> None:
+    """Raise ValueError for sessions of several numbered objects."""
+    first = None
+    for session in parser.sessions:
+        line, number = session.metadata.get("OBJECTNUMBER", (session.line, ""))
+        # Objects without a number have 0, and more than one name.
+        if number in ("", "0"):
+            continue
+        if first is not None and number != first:
+            raise parser.error(
+                f"the object is {number[:20]}, but that of sessions before is "
+                f"{first[:20]}: split the file, since `positions` is of one object.",
+                line,
+            )
+        first = number
 
 
 def _curve(

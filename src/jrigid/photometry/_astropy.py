@@ -1,6 +1,7 @@
 """Epochs and frames by astropy, an extra: time scales, and coordinates of a body."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Generator, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -27,9 +28,7 @@ def in_tdb(dates: Sequence[Decimal], time_scale: str) -> list[Decimal]:
     days = [int(date) for date in dates]
     fractions = [float(date - day) for date, day in zip(dates, days, strict=True)]
     make = extra("photometry", "astropy.time").Time
-    settings = extra("photometry", "astropy.utils.iers").conf
-    # Astropy has a table of leap seconds. It would look for a newer one on the web.
-    with settings.set_temp("auto_download", value=False):
+    with _no_download():
         times = make(np.array(days, float), fractions, format="jd", scale=time_scale)
         tdb = times.tdb
     return [
@@ -49,9 +48,8 @@ def geometry_of_coordinates(body: SkyCoord, observer: SkyCoord = None) -> Positi
             increase. At least four rows; a row a day is good for a body in the main
             belt, and one a minute for a satellite. It is where the light left it that
             is seen at `obstime`, as ephemerides of observers have it.
-        observer: A `SkyCoord` or a frame with data of the same shape, such as
-            `site.get_itrs(times)` of an `EarthLocation` or a spacecraft; the centre of
-            the Earth if None.
+        observer: An `EarthLocation`, or a `SkyCoord` of as many rows, such as that of a
+            spacecraft; the centre of the Earth if None.
 
     Returns:
         A function of the Julian dates of observation (TDB), for `read_alcdef`. It
@@ -88,6 +86,8 @@ def geometry_of_coordinates(body: SkyCoord, observer: SkyCoord = None) -> Positi
         f"Argument `body` must have an `obstime` of at least {_LEAST_ROWS} times that "
         "increase, but it has not.",
     )
+    if isinstance(observer, coordinates.EarthLocation):
+        observer = observer.get_itrs(times)
     if observer is None:
         earth = coordinates.get_body_barycentric("earth", times, ephemeris="builtin")
         observer = coordinates.SkyCoord(earth, frame="icrs")
@@ -107,4 +107,20 @@ def _from_sun(name: str, place: SkyCoord, times: Time) -> Vectors:
     )
     # Catalogues of orbits take the obliquity of 1976.
     frame = coordinates.HeliocentricEclipticIAU76(obstime=times)
-    return place.transform_to(frame).cartesian.xyz.to_value(units.m).T
+    with _no_download():
+        return place.transform_to(frame).cartesian.xyz.to_value(units.m).T
+
+
+@contextlib.contextmanager
+def _no_download() -> Generator[None, None, None]:
+    """Keep astropy from looking for newer tables of leap seconds and of the Earth.
+
+    It has tables of its own. Beyond their end the Earth's rotation is off by less than a
+    second in some years, which moves an observer by less than 500 m.
+    """
+    settings = extra("photometry", "astropy.utils.iers").conf
+    with (
+        settings.set_temp("auto_download", value=False),
+        settings.set_temp("auto_max_age", value=None),
+    ):
+        yield

@@ -69,7 +69,8 @@ class Ellipsoid(Readable):
         derived again from the integral over the unit sphere.
         """
         demand(
-            isinstance(scattering, LommelSeeliger),
+            # A subclass may be another law.
+            type(scattering) is LommelSeeliger,
             "Argument `scattering` must be `LommelSeeliger()` for an ellipsoid, whose "
             f"brightness is known by that law alone, but it is {scattering!r}: take "
             "`shape.facets()`.",

@@ -53,7 +53,7 @@ class Facets(Readable):
         normals: Real[ArrayLike, "facets 3"],
         albedo: Real[ArrayLike, " facets"] | None = None,
     ):
-        """Raise ValueError for shapes that do not fit."""
+        """Raise ValueError for wrong shapes or, where they are known, wrong values."""
         albedo = np.ones(np.shape(areas)) if albedo is None else albedo
         areas, normals, albedo = shaped(
             areas=(areas, None), normals=(normals, None, 3), albedo=(albedo, None)
@@ -63,6 +63,14 @@ class Facets(Readable):
             "Arguments `areas`, `normals` and `albedo` must have one entry for each "
             f"facet, but they have {len(areas)}, {len(normals)} and {len(albedo)}.",
         )
+        if is_concrete(areas) and is_concrete(normals):
+            # Triangles of no area have no normal. NaN is left to `brightness`.
+            deviations = np.abs(np.linalg.norm(normals, axis=1) - 1)
+            demand(
+                not np.any((areas < 0) | ((areas > 0) & (deviations > _FLAT))),
+                "Arguments `areas` and `normals` must be positive and unit vectors, but "
+                "they are not.",
+            )
         self.areas = areas
         self.normals = normals
         self.albedo = albedo

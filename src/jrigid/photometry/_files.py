@@ -40,6 +40,12 @@ class LightCurve:
     band: str = ""
     errors: Float[np.ndarray, " epochs"] | None = None
 
+    @property
+    def has_magnitudes(self) -> bool:
+        """Whether it is relative, and its brightness looks like magnitudes."""
+        least, largest = _MAGNITUDES
+        return self.is_relative and bool(least < np.mean(self.brightness) < largest)
+
 
 class _Lines:
     """The lines of a file that are not empty, and where a reader is among them."""
@@ -80,7 +86,8 @@ class _Lines:
             numbers = [Decimal(word) for word in words]
         except InvalidOperation:
             raise self.error(f"{what} must be numbers, but it is {words}.") from None
-        if not all(number.is_finite() for number in numbers):
+        # A decimal may be too large for a float.
+        if not np.all(np.isfinite(np.array(numbers, dtype=float))):
             raise self.error(f"{what} must be finite, but it is {words}.")
         return numbers
 
@@ -146,10 +153,7 @@ def read_light_curves(
             rows.append(row)
         zero = rows[0][0] if zero is None else zero
         curve = _curve(rows, zero, absolute == 0)
-        if (
-            curve.is_relative
-            and _MAGNITUDES[0] < curve.brightness.mean() < _MAGNITUDES[1]
-        ):
+        if curve.has_magnitudes:
             raise lines.error(
                 f"relative brightness must be about 1, but that of light curve {index + 1}"
                 f" is {curve.brightness.mean():.4g} in the mean: take 10^(-0.4 m) of "

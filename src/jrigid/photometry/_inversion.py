@@ -27,7 +27,10 @@ from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
     Readings,
+    check_threshold,
     is_within_noise,
+    neighbours_correlate,
+    noise_in_words,
     readings_of,
     stated_noise,
 )
@@ -43,8 +46,6 @@ _ROUND = (
     "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
     "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
 )
-# Standard deviations of a correlation of neighbouring residuals that is no chance.
-_SURE = 5.0
 # Radians between the momenta of a tumbler and of its mirror within which they are one.
 _ONE_POLE = 0.2
 # Digits of a period in hours whose error is not known.
@@ -66,12 +67,15 @@ class Inversion:
         correlation: Of the best alias's residuals at neighbouring points of a curve. It
             is near 0 for noise, and near 1 for a light curve that is missed.
         follows: Whether the best alias follows the curves to their noise, as far as it
-            is known: if it is not stated, its residuals need only be uncorrelated.
+            is known: if it is not stated, its residuals need only be uncorrelated. This
+            says little of curves whose points are far apart in time.
         determined: Whether one tumbler alone explains the curves, but for its mirror:
             the best one follows them, and there is no other alias.
         mirror: The best alias mirrored by the plane from which the body was seen, whose
             momentum is elsewhere. None if its chi-square is not near the least one.
         span: Time from the first epoch to the last [s].
+        is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
+            holds what the model misses.
     """
 
     aliases: list[Alias]
@@ -84,6 +88,7 @@ class Inversion:
     follows: bool
     determined: bool
     span: float
+    is_noise_found: bool = False
     mirror: Alias | None = None
 
     def report(self) -> str:
@@ -201,6 +206,7 @@ def find_tumblers(
     for mode in modes:
         check_option("modes", mode, tuple(MODES))
     whole_number("pairs", pairs)
+    check_threshold(threshold)
     # Too few points are an error.
     points_of(curves)
     known = stated_noise(curves, noise)
@@ -258,9 +264,9 @@ def _inversion(
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
     aliases = _weighted(every[:near], growth, width)
-    correlation, deviations = _correlation(every[0].residuals, curves)
+    correlation, is_coloured = neighbours_correlate(every[0].residuals, curves)
     # A noise that was found makes chi-square over its degrees of freedom 1.
-    follows = is_within_noise(reduced, freedom) if stated else deviations < _SURE
+    follows = is_within_noise(reduced, freedom) if stated else not is_coloured
     noise = readings.typical_noise()
     return Inversion(
         aliases=aliases,
@@ -270,9 +276,10 @@ def _inversion(
         reduced_chi_square=reduced if stated else 1.0,
         degrees_of_freedom=freedom,
         correlation=correlation,
-        follows=bool(follows),
-        determined=bool(near == 1 and follows),
+        follows=follows,
+        determined=near == 1 and follows,
         span=float(readings.span),
+        is_noise_found=not stated,
         mirror=_mirror(every[0], found, readings, scale, threshold),
     )
 
@@ -327,24 +334,6 @@ def _mirror(
     return mirror if is_apart else None
 
 
-def _correlation(
-    residuals: Float[np.ndarray, " points"], curves: Sequence[LightCurve]
-) -> tuple[float, float]:
-    """Correlation of residuals at neighbouring points of a curve.
-
-    Returns:
-        The correlation, and how many standard deviations it is above that of noise.
-    """
-    ends = np.cumsum([len(x.ts) for x in curves])
-    of_curves = np.split(residuals, ends[:-1])
-    products = np.concatenate([x[1:] * x[:-1] for x in of_curves])
-    if products.size == 0 or not np.any(residuals):
-        return 0.0, 0.0
-    correlation = np.mean(products) / np.mean(residuals**2)
-    # The correlation of n pairs of white residuals scatters by 1 / sqrt(n).
-    return float(correlation), float(correlation * np.sqrt(products.size))
-
-
 def report_of(inversion: Inversion) -> str:
     """The table of aliases in words."""
     lines = [_verdict(inversion)]
@@ -376,7 +365,7 @@ def _verdict(inversion: Inversion) -> str:
     points = f"chi-square over {inversion.degrees_of_freedom} degrees of freedom"
     value = (
         f"{points} is {inversion.reduced_chi_square:.2f} for a noise of "
-        f"{inversion.noise:.4f} mag"
+        f"{noise_in_words(inversion.noise, inversion.is_noise_found)}"
     )
     if not inversion.follows:
         return (

@@ -19,7 +19,7 @@ from jrigid._checks import demand
 from jrigid._numerics import product
 from jrigid._types import Scalar
 from jrigid.photometry._files import LightCurve
-from jrigid.photometry._readings import Readings, readings_of
+from jrigid.photometry._readings import Readings, check_list, readings_of
 
 # Frequencies in one resolution element, 1 over the span.
 _OVERSAMPLING = 4
@@ -124,6 +124,7 @@ def points_of(curves: Sequence[LightCurve]) -> int:
     Raises:
         ValueError: They are fewer than the numbers of a tumbler.
     """
+    check_list(curves)
     points = sum(len(x.ts) for x in curves)
     demand(
         points >= _LEAST_POINTS,

@@ -115,10 +115,6 @@ def _merged(
         bool(np.all(np.isfinite(areas)) and np.all(np.isfinite(normals))),
         "Argument `facets` must have finite areas and normals, but it has not.",
     )
-    demand(
-        bool(np.all(areas >= 0)),
-        "Argument `facets` must have areas that are not negative, but one is.",
-    )
     # Triangles of no area have no normal.
     there = (areas > 0) & (np.linalg.norm(normals, axis=1) > 0)
     areas = areas[there].astype(float)

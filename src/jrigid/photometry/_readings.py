@@ -18,7 +18,7 @@ EPOCHS = 128  # arrays are filled up to whole blocks of epochs
 _FACTORS = 16  # and of unknown factors
 # Of a column of the basis, in the epochs that were chosen; its size in all is 1.
 _LEAST_SIZE = 1e-9
-# Standard deviations of chi-square that are no chance.
+# Standard deviations of chi-square, and of a correlation, that are no chance.
 _SURE = 5.0
 
 
@@ -86,12 +86,12 @@ def stated_noise(
     Raises:
         ValueError: Errors of a curve that are not positive, or not one for each point.
     """
-    errors = [x.errors for x in curves if x.errors is not None]
+    errors = [np.asarray(x.errors) for x in curves if x.errors is not None]
     if noise is not None or not curves or len(errors) < len(curves):
         return noise
     for curve, of_curve in zip(curves, errors, strict=True):
         demand(
-            of_curve.shape == curve.ts.shape
+            of_curve.shape == np.shape(curve.ts)
             and bool(np.all(np.isfinite(of_curve) & (of_curve > 0))),
             "Argument `curves` must have positive `errors`, one for each point, but a "
             "curve has not: pass `noise`, or leave out such points.",
@@ -166,6 +166,28 @@ def _check_geometry(curves: Sequence[LightCurve]) -> None:
             f"Curve {index} of `curves` must have finite times and vectors other than 0, "
             "but it has not.",
         )
+        demand(
+            not curve.has_magnitudes,
+            f"Curve {index} of `curves` must hold brightness of about 1, but its mean is "
+            f"{np.mean(curve.brightness):.4g}: take 10^(-0.4 m) of magnitudes m.",
+        )
+
+
+def check_threshold(threshold: float) -> None:
+    """Raise ValueError unless the best of a search is within its threshold."""
+    demand(
+        threshold >= 0,
+        f"Argument `threshold` must not be negative, but is {threshold}.",
+    )
+
+
+def check_list(curves: Sequence[LightCurve]) -> None:
+    """Raise ValueError for a single light curve in place of a list."""
+    demand(
+        not isinstance(curves, LightCurve),
+        "Argument `curves` must be a list of light curves, but it is one: pass a list "
+        "of one.",
+    )
 
 
 def is_within_noise(reduced: float, freedom: int) -> bool:
@@ -174,6 +196,38 @@ def is_within_noise(reduced: float, freedom: int) -> bool:
     Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
     """
     return bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
+
+
+def neighbours_correlate(
+    residuals: Float[np.ndarray, " points"], curves: Sequence[LightCurve]
+) -> tuple[float, bool]:
+    """Correlation of residuals at points of a curve that follow each other in time.
+
+    Args:
+        residuals: Of all points, in the order of the curves [mag].
+        curves: The curves.
+
+    Returns:
+        The correlation, and whether it is more than that of noise.
+    """
+    ends = np.cumsum([len(x.ts) for x in curves])
+    in_order = [
+        of_curve[np.argsort(np.asarray(curve.ts), kind="stable")]
+        for of_curve, curve in zip(np.split(residuals, ends[:-1]), curves, strict=True)
+    ]
+    products = np.concatenate([x[1:] * x[:-1] for x in in_order])
+    if products.size == 0 or not np.any(residuals):
+        return 0.0, False
+    correlation = np.mean(products) / np.mean(residuals**2)
+    # The correlation of n pairs of white residuals scatters by 1 / sqrt(n).
+    deviations = correlation * np.sqrt(products.size)
+    return float(correlation), bool(deviations > _SURE)
+
+
+def noise_in_words(noise: float, is_found: bool) -> str:
+    """The noise in magnitudes, and whence it is."""
+    found = ", found from what the fit leaves" if is_found else ""
+    return f"{noise:.4f} mag{found}"
 
 
 def orthonormal(

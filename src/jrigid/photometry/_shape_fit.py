@@ -48,6 +48,8 @@ from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
     Readings,
     is_within_noise,
+    neighbours_correlate,
+    noise_in_words,
     readings_of,
     stated_noise,
 )
@@ -129,8 +131,12 @@ class ShapeFit:
             and the numbers deviate from what is expected, over its spread.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
-        follows: Whether the fit follows the curves to their noise, if that is stated.
-            Else nothing is known of it, and it is True.
+        correlation: Of the residuals at neighbouring points of a curve. It is near 0 for
+            noise, and near 1 for a light curve that is missed.
+        follows: Whether the fit follows the curves to their noise, as far as it is
+            known: if it is not stated, the residuals need only be uncorrelated.
+        is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
+            holds what the model misses.
         is_at_limit: Whether the moments are those of a flat or a round body, at the
             limit of real ones: the fit may have gone astray.
         open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
@@ -146,7 +152,9 @@ class ShapeFit:
     chi_square: float
     reduced_chi_square: float
     degrees_of_freedom: int
+    correlation: float
     follows: bool
+    is_noise_found: bool
     is_at_limit: bool
     open_share: float
     residuals: Float[np.ndarray, " epochs"] = dataclasses.field(repr=False)
@@ -248,7 +256,7 @@ def fit_shape(
         readings, _ = readings_of(curves, float(found))
         vector, quadratic = _minimum(vector, task, surface, readings)
     stated = known is not None
-    return _fit(vector, quadratic, task, surface, readings, middle, stated)
+    return _fit(vector, quadratic, task, surface, readings, middle, curves, stated)
 
 
 def _task(tumbler: Tumbler) -> Task:
@@ -367,12 +375,15 @@ def _fit(
     surface: Surface,
     readings: Readings,
     middle: float,
+    curves: Sequence[LightCurve],
     stated: bool,
 ) -> ShapeFit:
     """What was found."""
     free = freedom(readings, surface)
     residuals = np.asarray(_residuals(vector, task, surface, readings))
     reduced = float(np.sum(np.square(residuals))) / free
+    of_points = readings.in_magnitudes(residuals)
+    correlation, is_coloured = neighbours_correlate(of_points, curves)
     covariance = covariance_of(quadratic.normal, surface.sought)
     covariance = max(reduced, 1.0) * covariance
     estimates, slopes = _estimates_and_slopes(vector, task, surface, readings)
@@ -386,10 +397,12 @@ def _fit(
         chi_square=float(quadratic.chi_square),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
-        follows=not stated or is_within_noise(reduced, free),
+        correlation=correlation,
+        follows=is_within_noise(reduced, free) if stated else not is_coloured,
+        is_noise_found=not stated,
         is_at_limit=_is_at_limit(np.asarray(numbers.motion)),
         open_share=float(np.linalg.norm(openness(numbers.shape, surface))),
-        residuals=readings.in_magnitudes(residuals),
+        residuals=of_points,
     )
 
 
@@ -447,9 +460,10 @@ def _report(fit: ShapeFit) -> str:
     warnings = []
     if not fit.follows:
         warnings.append(
-            "The fit does not follow the light curves to their noise: its periods, the "
-            "epoch or the moments of the start are wrong, the noise is larger than "
-            "stated, or the body is far from convex. The errors mean nothing."
+            "The fit does not follow the light curves to their noise, and what is left "
+            f"at neighbouring points correlates by {fit.correlation:.2f}: its periods, "
+            "the epoch or the moments of the start are wrong, a stated noise is too "
+            "small, or the body is far from convex. The errors mean nothing."
         )
     if fit.is_at_limit:
         warnings.append(
@@ -461,7 +475,8 @@ def _report(fit: ShapeFit) -> str:
             *warnings,
             f"{fit.tumbler.mode} mode of a convex body: chi-square over "
             f"{fit.degrees_of_freedom} degrees of freedom is "
-            f"{fit.reduced_chi_square:.2f} for a noise of {fit.noise:.4f} mag",
+            f"{fit.reduced_chi_square:.2f} for a noise of "
+            f"{noise_in_words(fit.noise, fit.is_noise_found)}",
             f"   P_phi {in_hours(x.precession_period, error.precession_period)}, P_psi "
             f"{in_hours(x.rotation_period, error.rotation_period)}",
             "   angular momentum towards longitude "

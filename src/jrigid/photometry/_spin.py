@@ -34,7 +34,11 @@ from jrigid.photometry._model import axes_of_momentum
 from jrigid.photometry._polyhedron import MOST_OPEN, mesh_from_facets
 from jrigid.photometry._readings import (
     Readings,
+    check_list,
+    check_threshold,
     is_within_noise,
+    neighbours_correlate,
+    noise_in_words,
     readings_of,
     stated_noise,
 )
@@ -126,7 +130,12 @@ class SpinInversion:
             differ.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
-        follows: Whether the best solution follows the curves to their noise.
+        correlation: Of the best solution's residuals at neighbouring points of a curve.
+            It is near 0 for noise, and near 1 for a light curve that is missed.
+        follows: Whether the best solution follows the curves to their noise, as far as
+            it is known: if it is not stated, its residuals need only be uncorrelated.
+        is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
+            holds what the model misses.
     """
 
     solutions: list[Spin]
@@ -136,7 +145,9 @@ class SpinInversion:
     noise: float
     reduced_chi_square: float
     degrees_of_freedom: int
+    correlation: float
     follows: bool
+    is_noise_found: bool
 
     def report(self) -> str:
         """The table in words."""
@@ -220,6 +231,7 @@ def find_spin(
     law = Mixture() if scattering is None else scattering
     check_curves(curves, noise, fitted)
     check_options(degree, facets, law, fitted, closure)
+    check_threshold(threshold)
     known = stated_noise(curves, noise)
     readings, epoch = readings_of(curves, FIRST_NOISE if known is None else known)
     turns = _turns(float(readings.span), shortest, longest)
@@ -237,18 +249,22 @@ def find_spin(
     free = freedom(readings, surface)
     spins = search_spins(readings, surface, coarse, *turns)
     if known is None:
-        noise_found = FIRST_NOISE * np.sqrt(_light(spins, surface, readings) / free)
+        square = np.sum(_left(spins, surface, readings) ** 2)
+        noise_found = FIRST_NOISE * np.sqrt(square / free)
         # Closure and expectations are weighed against the noise, so that the minimum
         # moves with it.
         readings, epoch = readings_of(curves, float(noise_found))
         spins = settled(spins, surface, readings)
-    return _inversion(spins, surface, readings, epoch, known is not None, threshold)
+    return _inversion(
+        spins, surface, readings, epoch, curves, known is not None, threshold
+    )
 
 
 def check_curves(
     curves: Sequence[LightCurve], noise: float | None, fitted: Sequence[str]
 ) -> None:
     """Raise ValueError for curves that do not determine what is fitted."""
+    check_list(curves)
     demand(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
@@ -330,10 +346,12 @@ def _residuals(
     return spin_rows(vector, frame, surface, readings).residuals
 
 
-def _light(spins: Spins, surface: Surface, readings: Readings) -> float:
-    """Chi-square of the light of the best solution."""
-    residuals = _residuals(spins.numbers[0], spins.frames[0], surface, readings)
-    return float(np.sum(np.square(residuals)))
+def _left(
+    spins: Spins, surface: Surface, readings: Readings
+) -> Float[np.ndarray, " epochs"]:
+    """What the best solution leaves, over the noise."""
+    best = _residuals(spins.numbers[0], spins.frames[0], surface, readings)
+    return np.asarray(best)
 
 
 def _inversion(
@@ -341,12 +359,17 @@ def _inversion(
     surface: Surface,
     readings: Readings,
     epoch: float,
+    curves: Sequence[LightCurve],
     stated: bool,
     threshold: float,
 ) -> SpinInversion:
     """The table of what a search found."""
     free = freedom(readings, surface)
-    reduced = _light(spins, surface, readings) / free
+    left = _left(spins, surface, readings)
+    reduced = float(np.sum(left**2)) / free
+    correlation, is_coloured = neighbours_correlate(
+        readings.in_magnitudes(left), curves
+    )
     scale = max(reduced, 1.0)
     every = [
         _spin(spins.rows([i]), surface, readings, scale)
@@ -363,7 +386,9 @@ def _inversion(
         noise=readings.typical_noise(),
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
-        follows=not stated or is_within_noise(reduced, free),
+        correlation=correlation,
+        follows=is_within_noise(reduced, free) if stated else not is_coloured,
+        is_noise_found=not stated,
     )
 
 
@@ -470,13 +495,15 @@ def _verdict(found: SpinInversion) -> str:
     count = len(found.solutions)
     value = (
         f"chi-square over {found.degrees_of_freedom} degrees of freedom is "
-        f"{found.reduced_chi_square:.2f} for a noise of {found.noise:.4f} mag"
+        f"{found.reduced_chi_square:.2f} for a noise of "
+        f"{noise_in_words(found.noise, found.is_noise_found)}"
     )
     if not found.follows:
         return (
             "No steady rotation was found that follows the light curves to their noise: "
-            f"{value}. The noise is larger than stated, the body tumbles or is far from "
-            "convex, or its period is out of the range."
+            f"{value}, and what is left at neighbouring points correlates by "
+            f"{found.correlation:.2f}. The body tumbles or is far from convex, its period "
+            "is out of the range, or a stated noise is too small."
         )
     if count == 1:
         return f"One steady rotation explains the light curves: {value}."
