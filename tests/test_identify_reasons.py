@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import jrigid as jr
 from jrigid import identify
 from jrigid.identify import Status
+from jrigid.identify import _conventions as conventions
 from jrigid.identify import _host as host
 from jrigid.identify._reasons import reason
 
@@ -331,7 +332,7 @@ def scalar_last(q):
     ("attitudes", "words"),
     [
         (scalar_last, "scalar last: pass (w, x, y, z), by `jr.rotation.from_scipy`"),
-        (conjugated, "space to body: pass those from body to space"),
+        (conjugated, "from space to body: pass those from body to space"),
     ],
 )
 def test_the_convention_of_attitudes_beside_rates_is_named(turning, attitudes, words):
@@ -357,7 +358,7 @@ def test_rates_in_degrees_beside_attitudes_are_named(turning):
     ts, q, rates = turning
     gyro = identify.Rates(ts, DEGREES * rates, DEGREES * 0.01)
     found = identify.fit(BLIND, [(identify.Attitudes(ts, q, 0.01), gyro)], throw=False)
-    assert reason(found).startswith("The rates would fit if they were in degrees")
+    assert reason(found).startswith("The rates seem to be in degrees")
 
 
 def test_rates_along_space_axes_are_named(turning):
@@ -372,3 +373,56 @@ def test_rates_along_space_axes_are_named(turning):
     many = identify.fit_each(BLIND, both)
     expected = [[False, False, False, True], [False] * 4]
     np.testing.assert_array_equal(many.diagnostics.conventions, expected)
+
+
+def test_a_wrong_model_is_no_wrong_convention():
+    """A body that is brought nearly to rest, fitted without its drag."""
+    ts = np.linspace(0, 12, 60)
+
+    def damped(_, omega):
+        return (np.cross(MOMENTS * omega, omega) - 0.4 * omega) / MOMENTS
+
+    solved = solve_ivp(
+        damped, ts[[0, -1]], [0.9, 0.5, -1.4], "DOP853", rtol=1e-10, dense_output=True
+    )
+    q, rates = attitudes_of(solved.sol, ts), solved.sol(ts).T
+    records = identify.Attitudes(ts, q, 0.01), identify.Rates(ts, rates, 0.01)
+    found = identify.fit(BLIND, [records], throw=False)
+    assert found.reduced_chi_square > 100
+    assert not np.any(found.diagnostics.conventions)
+    # Nor does a wrong model hide a wrong convention.
+    turned = identify.Attitudes(ts, conjugated(q), 0.01), records[1]
+    wrong = identify.fit(BLIND, [turned], throw=False)
+    assert list(wrong.diagnostics.conventions) == [False, True, False, False]
+
+
+def test_turns_of_attitudes_and_rates_are_compared_at_any_times(turning, untyped):
+    """A gyro of a kilohertz beside a slow camera, with gaps, a leap and a bias."""
+    ts, q, _ = turning
+    rng = np.random.default_rng(0)
+
+    def euler(_, omega):
+        return np.cross(MOMENTS * omega, omega) / MOMENTS
+
+    fast = np.arange(0, 12, 0.01)
+    rates = solve_ivp(
+        euler, (0, 12), [0.4, 0.9, 0.5], "DOP853", fast, rtol=1e-10
+    ).y.T + 0.02 * rng.normal(size=(fast.size, 3))
+    rates[100:110] = np.nan
+    q = q.copy()
+    q[20] = [0.0, 1.0, 0.0, 0.0]
+    gyro = identify.Gyro(bias=jnp.array([0.1, 0.0, 0.0]))
+
+    def agree(attitudes, rates):
+        pair = (
+            identify.Attitudes(ts[None], attitudes[None], 0.01),
+            identify.Record(gyro, fast[None], rates[None], 0.02),
+        )
+        return conventions.turns_agree(pair)
+
+    shown = rates + np.array([0.1, 0.0, 0.0])
+    assert agree(q, shown)
+    assert not agree(conjugated(q), shown)
+    assert not agree(scalar_last(q), shown)
+    assert not agree(q, DEGREES * shown)
+    assert conventions.turns_agree((identify.Attitudes(ts, q, 0.01),)) is None

@@ -2,13 +2,19 @@
 
 Quaternions of other programs may be scalar last, or turn space axes to body axes.
 Rates may be in degrees a second or along space axes. A fit of such a record ends far
-from it. Then the record is read in these ways, too, and the report says which one fits.
+from it. Then the record is read in these ways, too, and the report says which one is
+right. Attitudes and rates of one motion tell it by themselves, whatever the torque: the
+body must turn from one attitude to the next as the rates say. Attitudes alone are
+fitted anew.
 """
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jrigid.identify import _host as host
 from jrigid.identify._quality import FOLLOWED, Fit, misfit, sums_of, unexplained
@@ -19,6 +25,12 @@ from jrigid.identify._sensors import AttitudeSensor, Gyro
 # the part of it that is left if that reading is right.
 _FAR = 10.0
 _LEFT = 0.25
+# Turns of attitudes and of rates are compared over a radian. They agree to this, in
+# which there is room for noise, for errors of a gyro and for other times of samples.
+_WINDOW = 1.0
+_AGREE = 0.3
+_COARSE = 2.0  # radians between samples of a gyro
+_MOST = 2000  # samples of a trial that are compared
 
 Records = tuple[Record, ...]
 # Returns None for records to which the convention does not apply.
@@ -55,9 +67,9 @@ def _space_to_body(records: Records) -> Records | None:
 
 
 def _degrees(records: Records) -> Records | None:
-    """Rates in degrees a second, beside a sensor that is no gyro."""
+    """Rates in degrees a second, beside attitudes."""
     # The inertia of a free body does not tell in which unit all rates are.
-    if all(isinstance(x.sensor, Gyro) for x in records):
+    if not any(isinstance(x.sensor, AttitudeSensor) for x in records):
         return None
     return _changed(records, Gyro, np.radians)
 
@@ -101,33 +113,104 @@ def explains(other: Fit, fit: Fit) -> bool:
     return bool(falls and unexplained(other) <= FOLLOWED)
 
 
+def turns_agree(records: Records) -> bool | None:
+    """Whether a body turns from attitude to attitude as the rates of its gyro say.
+
+    Returns:
+        None for records without both.
+    """
+    trackers = [x for x in records if isinstance(x.sensor, AttitudeSensor)]
+    gyros = [x for x in records if isinstance(x.sensor, Gyro)]
+    if not trackers or not gyros:
+        return None
+    attitudes = _of_sensor(trackers[0], trackers[0].sensor.attitude)
+    rates = _of_sensor(gyros[0], gyros[0].sensor.rates)
+    differences = [
+        _differences(*of_trial)
+        for of_trial in zip(
+            np.asarray(trackers[0].ts),
+            attitudes,
+            np.asarray(gyros[0].ts),
+            rates,
+            strict=True,
+        )
+    ]
+    # The median, since a few attitudes may have leapt.
+    together = np.concatenate(differences)
+    return bool(together.size > 0 and np.median(together) < _AGREE)
+
+
+def _of_sensor(record: Record, function: Callable[[Array], Any]) -> np.ndarray:
+    """What the values of a record say of the body (trials, n, ...)."""
+    return np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(record.values))
+
+
+def _differences(
+    tracker_times: Float[np.ndarray, " m"],
+    attitudes: Float[np.ndarray, "m 4"],
+    gyro_times: Float[np.ndarray, " n"],
+    rates: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, " pairs"]:
+    """Angles between the turns of pairs of attitudes and those of the rates [rad]."""
+    tracker_times, attitudes = _seen(tracker_times, attitudes)
+    gyro_times, rates = _seen(gyro_times, rates)
+    if min(len(attitudes), len(rates)) < 2:
+        return np.zeros(0)
+    vectors = np.diff(gyro_times)[:, None] * (rates[1:] + rates[:-1]) / 2
+    angles = np.linalg.norm(vectors, axis=1)
+    if np.median(angles) > _COARSE:
+        # Whole turns between samples would agree by chance.
+        return np.full(1, np.pi)
+    turned = np.array([0.0, *np.cumsum(angles)])
+    # From the first sample of the gyro to each.
+    turns = np.empty((len(rates), 4))
+    turns[0] = [1.0, 0.0, 0.0, 0.0]
+    for index, step in enumerate(host.exp(vectors)):
+        turns[index + 1] = host.multiply(turns[index], step)
+    # The sample of the gyro that is nearest to each attitude.
+    middles = (gyro_times[1:] + gyro_times[:-1]) / 2
+    nearest = np.searchsorted(middles, tracker_times)
+    ends = np.searchsorted(turned[nearest], turned[nearest] + _WINDOW)
+    begins = np.flatnonzero(ends < len(nearest))
+    ends = ends[begins]
+    by_rates = host.multiply(
+        host.conjugate(turns[nearest[begins]]), turns[nearest[ends]]
+    )
+    by_attitudes = host.multiply(host.conjugate(attitudes[begins]), attitudes[ends])
+    between = host.log(host.multiply(host.conjugate(by_attitudes), by_rates))
+    return np.linalg.norm(between, axis=1)
+
+
+def _seen(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first rows of which every number is there."""
+    is_seen = np.isfinite(times) & np.all(np.isfinite(values), axis=1)
+    return times[is_seen][:_MOST], values[is_seen][:_MOST]
+
+
 def in_words(conventions: np.ndarray) -> str:
-    """Which conventions would fit and what to pass, or an empty text without any."""
+    """Which conventions seem to be those of the record, or an empty text without any."""
     is_scalar_last, is_space_to_body, is_in_degrees, is_along_space = conventions
     if is_scalar_last and is_space_to_body:
         return (
-            "The attitudes would fit if they were scalar last, or from space to body; "
-            "they do not tell which. Pass (w, x, y, z) from body to space "
+            "The attitudes seem to be scalar last, or from space to body; they do not "
+            "tell which. Pass (w, x, y, z) from body to space "
             "(`jr.rotation.from_scipy`, `jr.rotation.conjugate`)."
         )
     if is_scalar_last:
         return (
-            "The attitudes would fit if they were scalar last: pass (w, x, y, z), by "
+            "The attitudes seem to be scalar last: pass (w, x, y, z), by "
             "`jr.rotation.from_scipy`."
         )
     if is_space_to_body:
         return (
-            "The attitudes would fit if they turned space to body: pass those from body "
-            "to space, by `jr.rotation.conjugate`."
+            "The attitudes seem to be from space to body: pass those from body to space, "
+            "by `jr.rotation.conjugate`."
         )
     if is_in_degrees:
-        return (
-            "The rates would fit if they were in degrees a second: multiply them by "
-            "pi / 180."
-        )
+        return "The rates seem to be in degrees a second: multiply them by pi / 180."
     if is_along_space:
         return (
-            "The rates would fit if they were along space axes: pass them along body "
-            "axes, by `jr.rotation.rotate_inverse`."
+            "The rates seem to be along space axes: pass them along body axes, by "
+            "`jr.rotation.rotate_inverse`."
         )
     return ""

@@ -60,9 +60,9 @@ class Diagnostics(eqx.Module):
         integration_error: Largest error of the motion over a segment of the record, in
             units of what is allowed. It is 0 where the motion is exact or `simulate`
             integrates it.
-        conventions: Whether a record that the fit is far from would fit if its
-            attitudes were scalar last, or from space to body; or if its rates were in
-            degrees a second, or along space axes.
+        conventions: Whether the attitudes of a record that the fit is far from seem to
+            be scalar last, or from space to body; or its rates in degrees a second, or
+            along space axes.
         input_result: `jrigid.RESULTS` of the input.
 
     >>> import jax.numpy as jnp, jrigid as jr

@@ -743,16 +743,29 @@ def _conventions(
 ) -> Bool[np.ndarray, " conventions"]:
     """In which other conventions the record would fit; in none if it is not far."""
     found = np.zeros(conventions.COUNT, bool)
+    records = on_host(task.records)
     if not conventions.is_far(best):
         return found
-    for index, records in conventions.readings(on_host(task.records)):
-        case, input_result = _case(task._replace(records=records), effort, False)
-        if is_good(input_result):
-            # A record that is read rightly needs no second search.
-            first = attempt(case, case.problem, case.starts[0], slow=False)
-            (other,) = run([first])
-            found[index] = conventions.explains(other, best)
+    agree = conventions.turns_agree(records)
+    if agree:
+        return found
+    for index, changed in conventions.readings(records):
+        if agree is None:
+            found[index] = _fits_as(task._replace(records=changed), best, effort)
+        else:
+            found[index] = conventions.turns_agree(changed)
     return found
+
+
+def _fits_as(task: _Task, best: Fit, effort: Effort) -> bool:
+    """Whether a record fits that was changed, while it did not before."""
+    case, input_result = _case(task, effort, False)
+    if not is_good(input_result):
+        return False
+    # A record that is read rightly needs no second search.
+    first = attempt(case, case.problem, case.starts[0], slow=False)
+    (other,) = run([first])
+    return conventions.explains(other, best)
 
 
 def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:

@@ -10,14 +10,13 @@ from jaxtyping import Float
 from jrigid._checks import demand
 from jrigid.photometry._astropy import TDB, TIME_SCALES, in_tdb
 from jrigid.photometry._files import ASTRONOMICAL_UNIT, LightCurve
-from jrigid.photometry._orbit import Positions, Vectors, light_time
+from jrigid.photometry._orbit import LEAST_DATE, Positions, Vectors, light_time
 
 _DAY = 86400  # s
 _DELIMITERS = {"PIPE": "|", "TAB": "\t"}
 # How a correction was applied: not at all, one value a session, one value a point.
 _CORRECTIONS = ("NONE", "AVERAGE", "POINT")
 # Programs write 99.99 where they measured no magnitude.
-_LEAST_DATE = 2_378_497  # 1800: no photometry is older
 _NO_MAGNITUDE = 90
 # The time of observation from that of the light's departure: errors shrink by 1e4 each.
 _LIGHT_TIME_STEPS = 3
@@ -122,7 +121,7 @@ class _Parser:
                 "DELIMITER between. Remove the line or correct DELIMITER."
             )
         date = self._number("the Julian date", words[0])
-        if date < _LEAST_DATE:
+        if date < LEAST_DATE:
             raise self.error(
                 f"the date {date} is no Julian date of this age: of a modified or "
                 "truncated one, add what was taken off (2400000.5 days for MJD)."

@@ -62,8 +62,10 @@ def geometry_of_coordinates(body: SkyCoord, observer: SkyCoord = None) -> Positi
         ValueError: Coordinates without times or distances, fewer than four, times that
             do not increase, or an `observer` of another shape.
 
-    Distances of astropy's GCRS contain the aberration of light, which moves a direction
-    by up to 1e-4 rad.
+    Right ascension, declination and distance from the Earth belong into the frame
+    "gcrs", also if a table says ICRF. The origin of "icrs", which is astropy's default,
+    is the barycentre of the solar system. GCRS has the aberration of light, which moves
+    a direction by up to 1e-4 rad.
 
     >>> import astropy.units as u, jrigid as jr, numpy as np
     >>> from astropy.coordinates import SkyCoord
@@ -77,7 +79,7 @@ def geometry_of_coordinates(body: SkyCoord, observer: SkyCoord = None) -> Positi
     [[ -46. -357.    8.]] [[ -72. -212.    8.]]
     """
     coordinates = extra("photometry", "astropy.coordinates")
-    times: Time = body.obstime
+    times: Time = getattr(body, "obstime", None)
     demand(
         isinstance(times, extra("photometry", "astropy.time").Time)
         and times.ndim == 1

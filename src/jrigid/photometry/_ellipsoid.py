@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jrigid._checks import array_of_shape, demand, whole_number
+from jrigid._checks import array_of_shape, demand, is_concrete, whole_number
 from jrigid._numerics import polynomial, safe_norm, sum_of_squares
 from jrigid._types import Readable, Scalar, Vector
 from jrigid.photometry._facets import Facets, facets_from_mesh
@@ -32,6 +32,13 @@ class Ellipsoid(Readable):
     semi_axes: Float[Array, "3"] = eqx.field(
         converter=lambda value: array_of_shape("semi_axes", value, (3,))
     )
+
+    def __check_init__(self):
+        """Reject lengths that are not positive, where they are known."""
+        demand(
+            not is_concrete(self.semi_axes) or not np.any(self.semi_axes <= 0),
+            f"Argument `semi_axes` must be positive, but it is {self.semi_axes}.",
+        )
 
     @property
     def moments(self) -> Vector:

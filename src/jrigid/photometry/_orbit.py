@@ -14,6 +14,8 @@ from jrigid.photometry._files import ASTRONOMICAL_UNIT
 SPEED_OF_LIGHT = 299792458.0  # m / s
 # Of the Sun [m^3 / s^2], JPL's ephemeris DE440.
 _GRAVITATIONAL_PARAMETER = 1.32712440041e20
+_RADIUS_OF_THE_SUN = 7e8  # m
+LEAST_DATE = 2_378_497  # 1800: no photometry is older
 _DAY = 86400.0  # s
 _J2000 = 2451545.0
 _CENTURY = 36525.0  # days
@@ -77,6 +79,16 @@ class Orbit(Readable):
             self.semi_major_axis > 0,
             "Argument `semi_major_axis` must be positive, but it is "
             f"{self.semi_major_axis}.",
+        )
+        demand(
+            self.semi_major_axis > _RADIUS_OF_THE_SUN,
+            "Argument `semi_major_axis` must be in metres, outside of the Sun, but it is "
+            f"{self.semi_major_axis}. (Catalogues have au: 1.496e11 m.)",
+        )
+        demand(
+            self.epoch >= LEAST_DATE,
+            f"Argument `epoch` must be a Julian date, but it is {self.epoch}. (Add "
+            "2400000.5 to a modified one.)",
         )
         demand(
             0 <= self.inclination <= np.pi,

@@ -26,6 +26,8 @@ _OVERSAMPLING = 4
 _OVERSAMPLING_OF_LINES = 8
 # Strongest lines of the ordinary periodogram of which one must be a line of the pair.
 _LINES = 10
+# A search takes minutes for 10,000 cycles. More than this are hours for seconds.
+_MOST_CYCLES = 100_000
 # Lines k f_phi + m f_psi that are the strongest ones of tumblers. An ellipsoid looks the
 # same after half a turn about each of its axes, so m is even.
 _STRONGEST = ((2, 0), (2, -2), (2, 2), (1, -2), (1, 2), (1, 0))
@@ -145,6 +147,11 @@ def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, 
         bool(span > _LEAST_CYCLES * shortest),
         "Argument `curves` must span more than half of `shortest`, but they span "
         f"{span:.4g} s.",
+    )
+    demand(
+        bool(span <= _MOST_CYCLES * shortest),
+        f"Argument `shortest` must be at least 1 / {_MOST_CYCLES} of the time that the "
+        f"curves span, {span:.4g} s, but it is {shortest:g} s: are periods in seconds?",
     )
     return span / longest, span / shortest
 

@@ -19,7 +19,7 @@ _FACTORS = 16  # and of unknown factors
 # Of a column of the basis, in the epochs that were chosen; its size in all is 1.
 _LEAST_SIZE = 1e-9
 # Standard deviations of chi-square, and of a correlation, that are no chance.
-_SURE = 5.0
+_SURE = 4.0
 
 
 class Readings(NamedTuple):

@@ -408,7 +408,8 @@ def _fit(
 
 def _is_at_limit(motion: Float[np.ndarray, " 11"]) -> bool:
     """Whether the ellipsoid of the moments is flat, or round about an axis."""
-    ratios = 1 / (1 + np.exp(-unpacked(motion).inertia))
+    # The logistic function, without an exponential that overflows.
+    ratios = (1 + np.tanh(unpacked(motion).inertia / 2)) / 2
     return bool(np.any((ratios < _AT_LIMIT) | (ratios > 1 - _AT_LIMIT)))
 
 
