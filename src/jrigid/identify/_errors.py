@@ -557,7 +557,7 @@ def _remainder(fit: Fit, known: Precision, white: np.ndarray) -> _Remainder:
         inflation = noise
     elif more:
         inflation = max(noise, 1.0)
-    if coloured:
+    if coloured and not quality.is_exact(fit):
         # A band that stands out may be the one that tells the numbers.
         inflation = inflation * band[0]
     return _Remainder(
@@ -565,7 +565,7 @@ def _remainder(fit: Fit, known: Precision, white: np.ndarray) -> _Remainder:
         freedom=freedom,
         noise=noise,
         band=band,
-        misfit=bool(more or coloured),
+        misfit=bool(more or coloured) and not quality.is_exact(fit),
         overstated=bool(less),
         inflation=inflation,
     )
@@ -719,7 +719,7 @@ def _status_of_match(
     # A fit that creeps along what is not determined is good.
     if largest > LARGEST_ERROR:
         return "UNIDENTIFIABLE"
-    if not fit.minimum.settled:
+    if not (fit.minimum.settled or quality.is_exact(fit)):
         return "NOT_CONVERGED"
     return "MISFIT" if remainder.overstated else "OK"
 

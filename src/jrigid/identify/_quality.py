@@ -24,6 +24,7 @@ GATE = 5.0  # standard deviations of chi-square
 FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not follow it
 # Whitened square of a sample, above its degrees of freedom, that is no noise.
 _REJECTED = 16.0
+_ROUNDING = 100.0  # times the resolution of numbers
 _SPOILT = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
@@ -197,6 +198,30 @@ def sums_of(fit: Fit) -> Sums:
 
 
 @once_for_each_fit
+def _square_of_rounding(fit: Fit) -> float:
+    """Sum of squares that rounding may leave, where no noise is stated; else 0."""
+    problem = fit.problem
+    if problem.options.noise_known:
+        return 0.0
+    weight = weights_of(problem, fit.kept)
+    unit = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
+    square = 0.0
+    for part, values in zip(problem.samples.parts, problem.samples.values, strict=True):
+        # Values that were not seen weigh nothing.
+        size = np.sqrt(np.nansum(values**2, axis=-1, keepdims=True))
+        square += float(np.sum(weight[:, part] * (unit[:, part] * size) ** 2))
+    return float((_ROUNDING * np.finfo(unit.dtype).eps) ** 2 * square)
+
+
+def is_exact(fit: Fit) -> bool:
+    """Whether a fit leaves no more than rounding of a record without a stated noise.
+
+    What is left then has neither a size nor a colour that would say anything.
+    """
+    return sums_of(fit).residual <= _square_of_rounding(fit)
+
+
+@once_for_each_fit
 def loudest_band_of(fit: Fit) -> tuple[float, float]:
     """`loudest_band` of the residuals, without those of saturated numbers."""
     white = np.sqrt(weights_of(fit.problem, fit.kept)) * fit.residual
@@ -211,7 +236,7 @@ def misfit(fit: Fit) -> float:
     # An approximate count: of a trial's own unknowns only its three rates.
     freedom = max(sums.count - numbers - 3.0 * fit.kept.shape[0], 1.0)
     ratio = sums.residual / freedom
-    good = bool(fit.minimum.settled) and np.isfinite(ratio)
+    good = is_exact(fit) or (bool(fit.minimum.settled) and np.isfinite(ratio))
     if problem.options.noise_known and not problem.options.robust:
         good = good and ratio < 1 + GATE * np.sqrt(2 / freedom)
         if good and not problem.options.dense:
@@ -287,7 +312,9 @@ def is_pure(fit: Fit, noise: float) -> bool:
     # Five numbers gain chi-square of five degrees of freedom from noise: its mean is 5
     # and its standard deviation sqrt(10).
     chance = 5 + GATE * 10**0.5 + 4 * np.log(max(sums.count, 1.0))
-    # Both sides are zero for constant readings, whose noise was not stated.
+    if is_exact(fit):
+        # The noise is that of rounding.
+        return sums.signal <= _square_of_rounding(fit)
     return bool(sums.signal - sums.residual <= noise * chance)
 
 
