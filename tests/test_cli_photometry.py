@@ -186,7 +186,7 @@ def test_the_best_tumbler_is_drawn(damit, tmp_path, monkeypatch):
         (["few.txt", "--report"], "Argument `path` must hold at least 12 points"),
         (
             ["curves.txt", "--longest", "3"],
-            "Arguments `--shortest` and `--longest` must be positive periods in this",
+            "must be positive periods in this order, but they are 4 and 3 hours",
         ),
     ],
 )

@@ -514,8 +514,10 @@ def test_mistakes_in_an_inversion_say_what_to_pass():
     with pytest.raises(ValueError, match="positive brightness"):
         ph.find_tumblers([dark], shortest=1.0, longest=2.0)
     magnitudes = dataclasses.replace(curve, brightness=np.linspace(15.0, 15.5, 20))
-    with pytest.raises(ValueError, match=r"its mean is 15.25: take 10\^\(-0.4 m\)"):
-        ph.find_tumblers([magnitudes], 0.02, shortest=1.0, longest=2.0)
+    for relative in (True, False):
+        wrong = dataclasses.replace(magnitudes, is_relative=relative)
+        with pytest.raises(ValueError, match=r"magnitudes m: take 10\^\(-0.4 m\)"):
+            ph.find_tumblers([wrong], 0.02, shortest=1.0, longest=2.0)
     few = ph.LightCurve(0.0, np.arange(5.0), np.ones(5), far[:5], far[:5], True)
     with pytest.raises(ValueError, match="at least 12 points"):
         ph.find_tumblers([few], shortest=1.0, longest=2.0)

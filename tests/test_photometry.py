@@ -523,7 +523,11 @@ def test_steady_rotation_has_no_tilt_and_no_excess():
         ("1\n1 0\n2450000.5 1 0 0 0 1 0 0\n", "line 3: the vector to the Sun must not"),
         (
             "1\n1 0\n2450000.5 18.2 1 0 0 1 0 0\n",
-            r"line 3: .*take 10\^\(-0.4 m\) of mag",
+            r"line 3: .*looks like magnitudes m: take 10\^\(-0.4 m\)",
+        ),
+        (
+            "1\n2 1\n0 15.1 1 0 0 1 0 0\n0 15.3 1 0 0 1 0 0\n",
+            r"line 4: .*looks like magnitudes m: take 10\^\(-0.4 m\)",
         ),
         ("1\n1 0\n2450000.5 nan 1 0 0 1 0 0\n", "line 3: .* must be finite"),
         ("0\n1 0\n", "line 2: the end of the file"),

@@ -204,6 +204,11 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     say(_summary(curves))
     shortest = _HOUR * options.shortest
     longest = _span(curves) if options.longest is None else _HOUR * options.longest
+    demand(
+        0 < shortest < longest,
+        "Arguments `--shortest` and `--longest` must be positive periods in this "
+        f"order, but they are {shortest / _HOUR:g} and {longest / _HOUR:g} hours.",
+    )
     say(f"periods from {shortest / _HOUR:g} to {longest / _HOUR:.5g} hours are tried")
     if not options.report:
         say(_table(photometry.period_pairs(curves, shortest, longest, count=10)))

@@ -188,7 +188,7 @@ def _seen(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def in_words(conventions: np.ndarray) -> str:
-    """Which conventions seem to be those of the record, or an empty text without any."""
+    """Which conventions the record seems to have, or an empty text without any."""
     is_scalar_last, is_space_to_body, is_in_degrees, is_along_space = conventions
     if is_scalar_last and is_space_to_body:
         return (
@@ -203,8 +203,8 @@ def in_words(conventions: np.ndarray) -> str:
         )
     if is_space_to_body:
         return (
-            "The attitudes seem to be from space to body: pass those from body to space, "
-            "by `jr.rotation.conjugate`."
+            "The attitudes seem to be from space to body: pass those from body to "
+            "space, by `jr.rotation.conjugate`."
         )
     if is_in_degrees:
         return "The rates seem to be in degrees a second: multiply them by pi / 180."

@@ -72,7 +72,8 @@ def geometry_of_coordinates(body: SkyCoord, observer: SkyCoord = None) -> Positi
     >>> from astropy.time import Time
     >>> times = Time(2451545.0 + np.arange(5), format="jd", scale="tdb")
     >>> ra, dec = np.linspace(70, 71, 5), np.full(5, 20.0)  # of an ephemeris
-    >>> body = SkyCoord(ra * u.deg, dec * u.deg, 1.5 * u.au, frame="gcrs", obstime=times)
+    >>> body = SkyCoord(
+    ...     ra * u.deg, dec * u.deg, 1.5 * u.au, frame="gcrs", obstime=times)
     >>> positions = jr.photometry.geometry_of_coordinates(body)
     >>> to_sun, to_observer = positions(times.jd[:1])
     >>> print(to_sun.round(-9) / 1e9, to_observer.round(-9) / 1e9)
@@ -104,8 +105,8 @@ def _from_sun(name: str, place: SkyCoord, times: Time) -> Vectors:
     coordinates = extra("photometry", "astropy.coordinates")
     demand(
         place.shape == times.shape and place.cartesian.x.unit.is_equivalent(units.m),
-        f"Argument `{name}` must have a distance for each of the {len(times)} times, but "
-        "it has not.",
+        f"Argument `{name}` must have a distance for each of the {len(times)} times, "
+        "but it has not.",
     )
     # Catalogues of orbits take the obliquity of 1976.
     frame = coordinates.HeliocentricEclipticIAU76(obstime=times)
@@ -117,8 +118,8 @@ def _from_sun(name: str, place: SkyCoord, times: Time) -> Vectors:
 def _no_download() -> Generator[None, None, None]:
     """Keep astropy from looking for newer tables of leap seconds and of the Earth.
 
-    It has tables of its own. Beyond their end the Earth's rotation is off by less than a
-    second in some years, which moves an observer by less than 500 m.
+    It has tables of its own. Beyond their end the Earth's rotation is off by less than
+    a second in some years, which moves an observer by less than 500 m.
     """
     settings = extra("photometry", "astropy.utils.iers").conf
     with (

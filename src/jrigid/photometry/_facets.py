@@ -68,8 +68,8 @@ class Facets(Readable):
             deviations = np.abs(np.linalg.norm(normals, axis=1) - 1)
             demand(
                 not np.any((areas < 0) | ((areas > 0) & (deviations > _FLAT))),
-                "Arguments `areas` and `normals` must be positive and unit vectors, but "
-                "they are not.",
+                "Arguments `areas` and `normals` must be positive and unit vectors, "
+                "but they are not.",
             )
         self.areas = areas
         self.normals = normals

@@ -11,7 +11,7 @@ from jrigid.photometry._facets import Facets, facets_from_mesh
 
 ASTRONOMICAL_UNIT = 149597870700.0  # m
 _DAY = 86400  # s
-# Means of a light curve that magnitudes have and relative brightness has not.
+# Between these are magnitudes of asteroids. Brightness may be, but has any scale.
 _MAGNITUDES = (5.0, 30.0)
 
 
@@ -42,9 +42,10 @@ class LightCurve:
 
     @property
     def has_magnitudes(self) -> bool:
-        """Whether it is relative, and its brightness looks like magnitudes."""
+        """Whether its brightness looks like magnitudes."""
         least, largest = _MAGNITUDES
-        return self.is_relative and bool(least < np.mean(self.brightness) < largest)
+        brightness = np.asarray(self.brightness)
+        return bool(np.all((brightness > least) & (brightness < largest)))
 
 
 class _Lines:
@@ -155,9 +156,9 @@ def read_light_curves(
         curve = _curve(rows, zero, absolute == 0)
         if curve.has_magnitudes:
             raise lines.error(
-                f"relative brightness must be about 1, but that of light curve {index + 1}"
-                f" is {curve.brightness.mean():.4g} in the mean: take 10^(-0.4 m) of "
-                "magnitudes m."
+                f"the brightness of light curve {index + 1} looks like magnitudes m: "
+                "take 10^(-0.4 m). Fluxes may be divided by any number, the same for all "
+                "curves of kind 1."
             )
         curves.append(curve)
     if lines:

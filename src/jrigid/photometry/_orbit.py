@@ -82,8 +82,8 @@ class Orbit(Readable):
         )
         demand(
             self.semi_major_axis > _RADIUS_OF_THE_SUN,
-            "Argument `semi_major_axis` must be in metres, outside of the Sun, but it is "
-            f"{self.semi_major_axis}. (Catalogues have au: 1.496e11 m.)",
+            "Argument `semi_major_axis` must be in metres, outside of the Sun, but it "
+            f"is {self.semi_major_axis}. (Catalogues have au: 1.496e11 m.)",
         )
         demand(
             self.epoch >= LEAST_DATE,
@@ -133,8 +133,8 @@ def earth_position(julian_dates: Real[ArrayLike, "..."]) -> Vectors:
     """Heliocentric positions of the Earth-Moon barycentre, ecliptic of J2000 [m].
 
     Mean elements with linear rates. From 1800 to 2050 they are within 1.5e-4 au of the
-    centre of the Earth, which is up to 3e-5 au from the barycentre. The light time of an
-    asteroid is thus off by at most 0.08 s.
+    centre of the Earth, which is up to 3e-5 au from the barycentre. The light time of
+    an asteroid is thus off by at most 0.08 s.
 
     Args:
         julian_dates: Epochs from 1800 to 2050 (TDB).

@@ -168,8 +168,8 @@ def _check_geometry(curves: Sequence[LightCurve]) -> None:
         )
         demand(
             not curve.has_magnitudes,
-            f"Curve {index} of `curves` must hold brightness of about 1, but its mean is "
-            f"{np.mean(curve.brightness):.4g}: take 10^(-0.4 m) of magnitudes m.",
+            f"Curve {index} of `curves` must hold brightness, but it looks like "
+            "magnitudes m: take 10^(-0.4 m). Fluxes may be divided by any number.",
         )
 
 

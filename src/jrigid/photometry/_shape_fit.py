@@ -131,8 +131,8 @@ class ShapeFit:
             and the numbers deviate from what is expected, over its spread.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
-        correlation: Of the residuals at neighbouring points of a curve. It is near 0 for
-            noise, and near 1 for a light curve that is missed.
+        correlation: Of the residuals at neighbouring points of a curve. It is near 0
+            for noise, and near 1 for a light curve that is missed.
         follows: Whether the fit follows the curves to their noise, as far as it is
             known: if it is not stated, the residuals need only be uncorrelated.
         is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
