@@ -199,10 +199,8 @@ def sums_of(fit: Fit) -> Sums:
 
 @once_for_each_fit
 def _square_of_rounding(fit: Fit) -> float:
-    """Sum of squares that rounding may leave, where no noise is stated; else 0."""
+    """Sum of squares that rounding of the values may leave."""
     problem = fit.problem
-    if problem.options.noise_known:
-        return 0.0
     weight = weights_of(problem, fit.kept)
     unit = np.diagonal(problem.samples.whitener, axis1=-2, axis2=-1)
     square = 0.0
@@ -218,6 +216,9 @@ def is_exact(fit: Fit) -> bool:
 
     What is left then has neither a size nor a colour that would say anything.
     """
+    # A stated noise says what is little. A plan, which leaves nothing, has one.
+    if fit.problem.options.noise_known:
+        return False
     return sums_of(fit).residual <= _square_of_rounding(fit)
 
 
