@@ -9,12 +9,11 @@ fitted anew.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jrigid.identify import _host as host
 from jrigid.identify._quality import FOLLOWED, Fit, misfit, sums_of, unexplained
@@ -123,8 +122,8 @@ def turns_agree(records: Records) -> bool | None:
     gyros = [x for x in records if isinstance(x.sensor, Gyro)]
     if not trackers or not gyros:
         return None
-    attitudes = _of_sensor(trackers[0], trackers[0].sensor.attitude)
-    rates = _of_sensor(gyros[0], gyros[0].sensor.rates)
+    attitudes = np.asarray(_attitudes(trackers[0]))
+    rates = np.asarray(_rates(gyros[0]))
     differences = [
         _differences(*of_trial)
         for of_trial in zip(
@@ -140,9 +139,16 @@ def turns_agree(records: Records) -> bool | None:
     return bool(together.size > 0 and np.median(together) < _AGREE)
 
 
-def _of_sensor(record: Record, function: Callable[[Array], Any]) -> np.ndarray:
-    """What the values of a record say of the body (trials, n, ...)."""
-    return np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(record.values))
+@jax.jit
+def _attitudes(record: Record) -> Any:
+    """Attitudes of the body (trials, n, 4)."""
+    return jax.vmap(jax.vmap(record.sensor.attitude))(record.values)
+
+
+@jax.jit
+def _rates(record: Record) -> Any:
+    """Angular velocities of the body (trials, n, 3)."""
+    return jax.vmap(jax.vmap(record.sensor.rates))(record.values)
 
 
 def _differences(
