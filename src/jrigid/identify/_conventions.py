@@ -9,6 +9,7 @@ fitted anew.
 """
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import equinox as eqx
 import jax

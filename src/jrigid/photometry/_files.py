@@ -11,8 +11,10 @@ from jrigid.photometry._facets import Facets, facets_from_mesh
 
 ASTRONOMICAL_UNIT = 149597870700.0  # m
 _DAY = 86400  # s
-# Between these are magnitudes of asteroids. Brightness may be, but has any scale.
+# Between these are magnitudes of asteroids. Brightness may be, but has any scale. In a
+# curve, magnitudes differ by less than this factor, which is 3 mag at 10.
 _MAGNITUDES = (5.0, 30.0)
+_FACTOR = 1.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,8 @@ class LightCurve:
         """Whether its brightness looks like magnitudes."""
         least, largest = _MAGNITUDES
         brightness = np.asarray(self.brightness)
-        return bool(np.all((brightness > least) & (brightness < largest)))
+        inside = np.all((brightness > least) & (brightness < largest))
+        return bool(inside and np.max(brightness) < _FACTOR * np.min(brightness))
 
 
 class _Lines:

@@ -117,7 +117,7 @@ def readings_of(
     demand(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
-    _check_geometry(curves)
+    _check_curves(curves)
     demand(
         bool(np.all((noise > 0) & np.isfinite(noise))),
         f"Argument `noise` must be positive and finite, but it is {noise}.",
@@ -147,8 +147,8 @@ def readings_of(
     return filled(readings), epoch + middle / _DAY
 
 
-def _check_geometry(curves: Sequence[LightCurve]) -> None:
-    """Raise ValueError for a curve without points, or with what is no direction."""
+def _check_curves(curves: Sequence[LightCurve]) -> None:
+    """Raise ValueError for curves without points or directions, and for magnitudes."""
     for index, curve in enumerate(curves):
         count = np.size(curve.ts)
         vectors = [np.asarray(x) for x in (curve.to_sun, curve.to_observer)]
@@ -166,11 +166,12 @@ def _check_geometry(curves: Sequence[LightCurve]) -> None:
             f"Curve {index} of `curves` must have finite times and vectors other than 0, "
             "but it has not.",
         )
-        demand(
-            not curve.has_magnitudes,
-            f"Curve {index} of `curves` must hold brightness, but it looks like "
-            "magnitudes m: take 10^(-0.4 m). Fluxes may be divided by any number.",
-        )
+    # A body of some metres has brightness of this size, too, but hardly in every curve.
+    demand(
+        not all(curve.has_magnitudes for curve in curves),
+        "Argument `curves` must hold brightness, but it looks like magnitudes m: take "
+        "10^(-0.4 m). Fluxes may be divided by any number.",
+    )
 
 
 def check_threshold(threshold: float) -> None:
