@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
 
 import jrigid as jr
 
@@ -96,3 +97,24 @@ def both_ways(function, x):
     basis = jnp.eye(x.size).reshape(x.size, *x.shape)
     columns = jnp.moveaxis(jax.vmap(push)(basis), 0, -1).reshape(*value.shape, *x.shape)
     return value, columns, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.size))
+
+
+def reference_attitude(omega, ts, attitude0=(1.0, 0.0, 0.0, 0.0)):
+    """Attitude from a rate that is known at every time, by scipy."""
+
+    def rate(t, q):
+        w, x, y, z = q
+        a, b, c = omega(t)
+        return 0.5 * np.array(
+            [
+                -x * a - y * b - z * c,
+                w * a + y * c - z * b,
+                w * b + z * a - x * c,
+                w * c + x * b - y * a,
+            ]
+        )
+
+    solution = solve_ivp(
+        rate, (ts[0], ts[-1]), attitude0, "DOP853", ts, rtol=1e-13, atol=1e-14
+    )
+    return solution.y.T

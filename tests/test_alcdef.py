@@ -19,6 +19,7 @@ LIGHT = 299792458.0
 DAY = 86400.0
 GM = 1.32712440041e20
 J2000 = 2451545.0
+OBLIQUITY = np.radians(84381.448 / 3600)  # of the ecliptic of J2000
 ORBIT = ph.Orbit(2.3 * AU, 0.35, 0.2, 1.1, 2.5, 0.7, 2457000.5)
 DATES = [f"{2457100.5 + 0.013 * i:.6f}" for i in range(40)]
 
@@ -372,8 +373,7 @@ def test_equatorial_coordinates_are_turned_by_the_obliquity():
     rng = np.random.default_rng(0)
     from_earth = AU * rng.normal(size=(4, 3))
     _, to_observer = ph.geometry_of_coordinates(sky("gcrs", from_earth, days))(days)
-    obliquity = np.radians(84381.448 / 3600)
-    cosine, sine = np.cos(obliquity), np.sin(obliquity)
+    cosine, sine = np.cos(OBLIQUITY), np.sin(OBLIQUITY)
     turn = np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])
     np.testing.assert_allclose(
         to_observer, -from_earth @ turn.T, rtol=0, atol=5e-4 * AU
@@ -395,8 +395,7 @@ def test_an_observer_is_away_from_the_centre_of_the_earth():
     offset = (from_site(dates)[1] - from_centre(dates)[1])[2]
     np.testing.assert_array_equal(from_site(dates)[1], again(dates)[1])
     x, y, z = offset
-    obliquity = np.radians(84381.448 / 3600)
-    ascension = np.arctan2(np.cos(obliquity) * y - np.sin(obliquity) * z, x)
+    ascension = np.arctan2(np.cos(OBLIQUITY) * y - np.sin(OBLIQUITY) * z, x)
     assert abs(np.linalg.norm(offset) - 6.4e6) < 2e3
     assert abs(np.degrees(ascension) % 360 - 280.46) < 0.01
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from helpers import ATTITUDE, reference_attitude
 from jaxtyping import Array, Float
 from scipy.integrate import solve_ivp
 
@@ -23,16 +24,23 @@ BLIND = jr.RigidBody(np.ones(3))
 TS = np.arange(200) * 0.01
 NOISE = 0.02
 DEGREES = 180 / np.pi
+SLOW = [0.4, 0.9, 0.5]  # rad/s
+
+
+def solved(ts, omega0, drag=0.0):
+    """Rates of a body as a function of time, by scipy."""
+
+    def euler(_, omega):
+        return (np.cross(MOMENTS * omega, omega) - drag * omega) / MOMENTS
+
+    accuracy = {"rtol": 1e-10, "atol": 1e-10}
+    span = ts[[0, -1]]
+    return solve_ivp(euler, span, omega0, "DOP853", dense_output=True, **accuracy).sol
 
 
 def motion(ts):
-    """Rates of a free body, by scipy."""
-
-    def euler(_, omega):
-        return np.cross(MOMENTS * omega, omega) / MOMENTS
-
-    spin = np.array([6.0, 5.0, -6.0])
-    return solve_ivp(euler, ts[[0, -1]], spin, "DOP853", ts, rtol=1e-10, atol=1e-10).y.T
+    """Rates of a free body."""
+    return solved(ts, [6.0, 5.0, -6.0])(ts).T
 
 
 def first_line(values, sigma, **options):
@@ -282,42 +290,17 @@ def test_a_noise_stated_a_little_too_small_is_no_scatter_between_trials(readings
 # Conventions of other programs
 
 
-def attitudes_of(rates, ts):
-    """Attitudes from body to space and angular velocities, by scipy."""
-
-    def kinematics(t, q):
-        w, x, y, z = q
-        a, b, c = rates(t)
-        return 0.5 * np.array(
-            [
-                -x * a - y * b - z * c,
-                w * a + y * c - z * b,
-                w * b + z * a - x * c,
-                w * c + x * b - y * a,
-            ]
-        )
-
-    start = np.array([0.5, -0.5, 0.1, 0.7])
-    start = start / np.linalg.norm(start)
-    return solve_ivp(kinematics, ts[[0, -1]], start, "DOP853", ts, rtol=1e-10).y.T
-
-
 @pytest.fixture(scope="module")
 def turning():
     """Times, noisy attitudes and noisy rates of a free body."""
     ts = np.linspace(0, 12, 60)
     rng = np.random.default_rng(3)
 
-    def euler(_, omega):
-        return np.cross(MOMENTS * omega, omega) / MOMENTS
-
-    solved = solve_ivp(
-        euler, ts[[0, -1]], [0.4, 0.9, 0.5], "DOP853", rtol=1e-10, dense_output=True
-    )
-    q = attitudes_of(solved.sol, ts)
+    rates = solved(ts, SLOW)
+    q = reference_attitude(rates, ts, ATTITUDE)
     turns = 0.01 * rng.normal(size=(60, 3))
     noisy = host.multiply(q, host.exp(turns))
-    return ts, noisy, solved.sol(ts).T + 0.01 * rng.normal(size=(60, 3))
+    return ts, noisy, rates(ts).T + 0.01 * rng.normal(size=(60, 3))
 
 
 def conjugated(q):
@@ -379,14 +362,9 @@ def test_a_wrong_model_is_no_wrong_convention():
     """A body that is brought nearly to rest, fitted without its drag."""
     ts = np.linspace(0, 12, 60)
 
-    def damped(_, omega):
-        return (np.cross(MOMENTS * omega, omega) - 0.4 * omega) / MOMENTS
-
-    solved = solve_ivp(
-        damped, ts[[0, -1]], [0.9, 0.5, -1.4], "DOP853", rtol=1e-10, dense_output=True
-    )
-    q, rates = attitudes_of(solved.sol, ts), solved.sol(ts).T
-    records = identify.Attitudes(ts, q, 0.01), identify.Rates(ts, rates, 0.01)
+    rates = solved(ts, [0.9, 0.5, -1.4], drag=0.4)
+    q = reference_attitude(rates, ts, ATTITUDE)
+    records = identify.Attitudes(ts, q, 0.01), identify.Rates(ts, rates(ts).T, 0.01)
     found = identify.fit(BLIND, [records], throw=False)
     assert found.reduced_chi_square > 100
     assert not np.any(found.diagnostics.conventions)
@@ -401,13 +379,8 @@ def test_turns_of_attitudes_and_rates_are_compared_at_any_times(turning, untyped
     ts, q, _ = turning
     rng = np.random.default_rng(0)
 
-    def euler(_, omega):
-        return np.cross(MOMENTS * omega, omega) / MOMENTS
-
     fast = np.arange(0, 12, 0.01)
-    rates = solve_ivp(
-        euler, (0, 12), [0.4, 0.9, 0.5], "DOP853", fast, rtol=1e-10
-    ).y.T + 0.02 * rng.normal(size=(fast.size, 3))
+    rates = solved(ts, SLOW)(fast).T + 0.02 * rng.normal(size=(fast.size, 3))
     rates[100:110] = np.nan
     q = q.copy()
     q[20] = [0.0, 1.0, 0.0, 0.0]

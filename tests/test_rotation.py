@@ -10,7 +10,15 @@ import scipy.integrate
 import scipy.linalg
 import scipy.spatial
 import scipy.stats
-from helpers import ATTITUDE, DTYPES, MOMENTS, OMEGA, quick_jit, ulps
+from helpers import (
+    ATTITUDE,
+    DTYPES,
+    MOMENTS,
+    OMEGA,
+    quick_jit,
+    reference_attitude,
+    ulps,
+)
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -681,27 +689,6 @@ def test_dead_reckoning_of_short_records():
         errors.append(same_attitude(found, reference_attitude(linear, ts)[-1]))
     assert errors[1] < 1e-6
     assert errors[0] / errors[1] > 2**4.5
-
-
-def reference_attitude(omega, ts, attitude0=(1.0, 0.0, 0.0, 0.0)):
-    """Attitude from a rate that is known at every time, by scipy."""
-
-    def rate(t, q):
-        w, x, y, z = q
-        a, b, c = omega(t)
-        return 0.5 * np.array(
-            [
-                -x * a - y * b - z * c,
-                w * a + y * c - z * b,
-                w * b + z * a - x * c,
-                w * c + x * b - y * a,
-            ]
-        )
-
-    solution = scipy.integrate.solve_ivp(
-        rate, (ts[0], ts[-1]), attitude0, "DOP853", ts, rtol=1e-13, atol=1e-14
-    )
-    return solution.y.T
 
 
 def test_dead_reckoning_follows_a_tumbling_body():

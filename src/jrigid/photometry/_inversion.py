@@ -28,8 +28,7 @@ from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
     Readings,
     check_threshold,
-    is_within_noise,
-    neighbours_correlate,
+    follows,
     noise_in_words,
     readings_of,
     stated_noise,
@@ -264,9 +263,9 @@ def _inversion(
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
     aliases = _weighted(every[:near], growth, width)
-    correlation, is_coloured = neighbours_correlate(every[0].residuals, curves)
-    # A noise that was found makes chi-square over its degrees of freedom 1.
-    follows = is_within_noise(reduced, freedom) if stated else not is_coloured
+    correlation, is_followed = follows(
+        every[0].residuals, curves, reduced, freedom, stated
+    )
     noise = readings.typical_noise()
     return Inversion(
         aliases=aliases,
@@ -276,8 +275,8 @@ def _inversion(
         reduced_chi_square=reduced if stated else 1.0,
         degrees_of_freedom=freedom,
         correlation=correlation,
-        follows=follows,
-        determined=near == 1 and follows,
+        follows=is_followed,
+        determined=near == 1 and is_followed,
         span=float(readings.span),
         is_noise_found=not stated,
         mirror=_mirror(every[0], found, readings, scale, threshold),

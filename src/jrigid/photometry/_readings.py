@@ -191,25 +191,41 @@ def check_list(curves: Sequence[LightCurve]) -> None:
     )
 
 
-def is_within_noise(reduced: float, freedom: int) -> bool:
-    """Whether chi-square over its degrees of freedom may be that of noise.
-
-    Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
-    """
-    return bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
-
-
-def neighbours_correlate(
-    residuals: Float[np.ndarray, " points"], curves: Sequence[LightCurve]
+def follows(
+    residuals: Float[np.ndarray, " points"],
+    curves: Sequence[LightCurve],
+    reduced: float,
+    freedom: int,
+    stated: bool,
 ) -> tuple[float, bool]:
-    """Correlation of residuals at points of a curve that follow each other in time.
+    """Whether what a fit leaves of light curves is no more than noise.
 
     Args:
         residuals: Of all points, in the order of the curves [mag].
         curves: The curves.
+        reduced: Chi-square over its degrees of freedom.
+        freedom: These.
+        stated: Whether the noise was stated.
 
     Returns:
-        The correlation, and whether it is more than that of noise.
+        The correlation of residuals at neighbouring points, and whether the fit follows
+        the curves.
+    """
+    correlation, deviations = _correlation(residuals, curves)
+    if stated:
+        # Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
+        return correlation, bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
+    # A noise that was found makes chi-square over its degrees of freedom 1.
+    return correlation, deviations <= _SURE
+
+
+def _correlation(
+    residuals: Float[np.ndarray, " points"], curves: Sequence[LightCurve]
+) -> tuple[float, float]:
+    """Correlation of residuals at points of a curve that follow each other in time.
+
+    Returns:
+        The correlation, and how many standard deviations it is above that of noise.
     """
     ends = np.cumsum([len(x.ts) for x in curves])
     in_order = [
@@ -218,11 +234,10 @@ def neighbours_correlate(
     ]
     products = np.concatenate([x[1:] * x[:-1] for x in in_order])
     if products.size == 0 or not np.any(residuals):
-        return 0.0, False
+        return 0.0, 0.0
     correlation = np.mean(products) / np.mean(residuals**2)
     # The correlation of n pairs of white residuals scatters by 1 / sqrt(n).
-    deviations = correlation * np.sqrt(products.size)
-    return float(correlation), bool(deviations > _SURE)
+    return float(correlation), float(correlation * np.sqrt(products.size))
 
 
 def noise_in_words(noise: float, is_found: bool) -> str:

@@ -47,8 +47,7 @@ from jrigid.photometry._model import (
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
     Readings,
-    is_within_noise,
-    neighbours_correlate,
+    follows,
     noise_in_words,
     readings_of,
     stated_noise,
@@ -383,7 +382,7 @@ def _fit(
     residuals = np.asarray(_residuals(vector, task, surface, readings))
     reduced = float(np.sum(np.square(residuals))) / free
     of_points = readings.in_magnitudes(residuals)
-    correlation, is_coloured = neighbours_correlate(of_points, curves)
+    correlation, is_followed = follows(of_points, curves, reduced, free, stated)
     covariance = covariance_of(quadratic.normal, surface.sought)
     covariance = max(reduced, 1.0) * covariance
     estimates, slopes = _estimates_and_slopes(vector, task, surface, readings)
@@ -398,7 +397,7 @@ def _fit(
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
         correlation=correlation,
-        follows=is_within_noise(reduced, free) if stated else not is_coloured,
+        follows=is_followed,
         is_noise_found=not stated,
         is_at_limit=_is_at_limit(np.asarray(numbers.motion)),
         open_share=float(np.linalg.norm(openness(numbers.shape, surface))),

@@ -36,8 +36,7 @@ from jrigid.photometry._readings import (
     Readings,
     check_list,
     check_threshold,
-    is_within_noise,
-    neighbours_correlate,
+    follows,
     noise_in_words,
     readings_of,
     stated_noise,
@@ -367,8 +366,8 @@ def _inversion(
     free = freedom(readings, surface)
     left = _left(spins, surface, readings)
     reduced = float(np.sum(left**2)) / free
-    correlation, is_coloured = neighbours_correlate(
-        readings.in_magnitudes(left), curves
+    correlation, is_followed = follows(
+        readings.in_magnitudes(left), curves, reduced, free, stated
     )
     scale = max(reduced, 1.0)
     every = [
@@ -387,7 +386,7 @@ def _inversion(
         reduced_chi_square=reduced,
         degrees_of_freedom=free,
         correlation=correlation,
-        follows=is_within_noise(reduced, free) if stated else not is_coloured,
+        follows=is_followed,
         is_noise_found=not stated,
     )
 
