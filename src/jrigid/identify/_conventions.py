@@ -14,7 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jrigid.identify import _host as host
 from jrigid.identify._quality import FOLLOWED, Fit, misfit, sums_of, unexplained
@@ -37,11 +37,16 @@ Records = tuple[Record, ...]
 Reading = Callable[[Records], Records | None]
 
 
+def _of_kind(records: Records, sensor: type) -> list[Record]:
+    """Records of one kind of sensor."""
+    return [x for x in records if isinstance(x.sensor, sensor)]
+
+
 def _changed(
     records: Records, sensor: type, change: Callable[[np.ndarray], np.ndarray]
 ) -> Records | None:
     """Records of which the values of one kind of sensor are changed."""
-    if not any(isinstance(x.sensor, sensor) for x in records):
+    if not _of_kind(records, sensor):
         return None
     return tuple(
         _with_values(x, change(np.asarray(x.values)))
@@ -69,15 +74,15 @@ def _space_to_body(records: Records) -> Records | None:
 def _degrees(records: Records) -> Records | None:
     """Rates in degrees a second, beside attitudes."""
     # The inertia of a free body does not tell in which unit all rates are.
-    if not any(isinstance(x.sensor, AttitudeSensor) for x in records):
+    if not _of_kind(records, AttitudeSensor):
         return None
     return _changed(records, Gyro, np.radians)
 
 
 def _space_axes(records: Records) -> Records | None:
     """Rates along space axes, beside attitudes at the same times."""
-    trackers = [x for x in records if isinstance(x.sensor, AttitudeSensor)]
-    gyros = [x for x in records if isinstance(x.sensor, Gyro)]
+    trackers = _of_kind(records, AttitudeSensor)
+    gyros = _of_kind(records, Gyro)
     if len(trackers) != 1 or not gyros:
         return None
     times = np.asarray(trackers[0].ts)
@@ -113,14 +118,45 @@ def explains(other: Fit, fit: Fit) -> bool:
     return bool(falls and unexplained(other) <= FOLLOWED)
 
 
+def of_turns(records: Records) -> Bool[np.ndarray, " conventions"] | None:
+    """The convention in which turns of attitudes and of rates agree best, if in one.
+
+    Returns:
+        None for records without both.
+    """
+    agree = turns_agree(records)
+    if agree is None:
+        return None
+    found = np.zeros(COUNT, bool)
+    if agree:
+        return found
+    differences = np.full(COUNT, np.inf)
+    for index, changed in readings(records):
+        differences[index] = _difference(changed)
+    # Another convention may come near by chance.
+    best = np.argmin(differences)
+    found[best] = differences[best] < _AGREE
+    return found
+
+
 def turns_agree(records: Records) -> bool | None:
     """Whether a body turns from attitude to attitude as the rates of its gyro say.
 
     Returns:
         None for records without both.
     """
-    trackers = [x for x in records if isinstance(x.sensor, AttitudeSensor)]
-    gyros = [x for x in records if isinstance(x.sensor, Gyro)]
+    difference = _difference(records)
+    return None if difference is None else difference < _AGREE
+
+
+def _difference(records: Records) -> float | None:
+    """Median angle between turns of attitudes and of rates over a radian [rad].
+
+    Returns:
+        None for records without both, infinity where nothing can be compared.
+    """
+    trackers = _of_kind(records, AttitudeSensor)
+    gyros = _of_kind(records, Gyro)
     if not trackers or not gyros:
         return None
     attitudes = np.asarray(_attitudes(trackers[0]))
@@ -137,7 +173,7 @@ def turns_agree(records: Records) -> bool | None:
     ]
     # The median, since a few attitudes may have leapt.
     together = np.concatenate(differences)
-    return bool(together.size > 0 and np.median(together) < _AGREE)
+    return float(np.median(together)) if together.size > 0 else np.inf
 
 
 @jax.jit

@@ -746,14 +746,11 @@ def _conventions(
     records = on_host(task.records)
     if not conventions.is_far(best):
         return found
-    agree = conventions.turns_agree(records)
-    if agree:
-        return found
+    by_turns = conventions.of_turns(records)
+    if by_turns is not None:
+        return by_turns
     for index, changed in conventions.readings(records):
-        if agree is None:
-            found[index] = _fits_as(task._replace(records=changed), best, effort)
-        else:
-            found[index] = conventions.turns_agree(changed)
+        found[index] = _fits_as(task._replace(records=changed), best, effort)
     return found
 
 
