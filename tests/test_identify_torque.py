@@ -287,7 +287,11 @@ def test_a_trial_of_another_body_is_named(rng):
     found = identify.fit(BLIND, records, unmodelled="estimate", throw=False)
     np.testing.assert_array_equal(np.flatnonzero(found.rejected_trials), [3])
     assert "trials left out: 3" in str(found)
+    assert "trials differ" not in str(found)
     assert np.all(np.abs(off(found)) < 4), str(found)
+    # The trial that is left out says nothing of the torque.
+    assert found.status == identify.Status.OK, str(found)
+    assert np.all(found.level_errors < 0.5 * found.level)
 
 
 def test_a_level_without_bound_is_a_failed_fit():

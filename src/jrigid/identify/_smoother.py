@@ -249,8 +249,9 @@ def solve_positive(matrix: Array, columns: Array) -> tuple[Array, Array]:
         Solutions (n, k), and the logarithm of the determinant.
     """
     # Unit diagonal, since rates, turns and numbers have different units.
-    size = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
-    size = jnp.where(size > 0, size, 1.0)
+    diagonal = jnp.diagonal(matrix)
+    # A trial that was left out has zeros, where the root has no derivative.
+    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     scaled = matrix / size[:, None] / size[None, :]
     eye = jnp.eye(size.size, dtype=size.dtype)
     # Rounding must not make a nearly singular matrix indefinite.

@@ -135,14 +135,27 @@ def _diagonal(matrix: Any) -> np.ndarray:
     return np.maximum(np.diagonal(np.asarray(matrix, np.float64)), 1e-300)
 
 
+def _spread_of_trials(result: FitResult) -> float:
+    """How many times larger chi-square is in some trials than in others.
+
+    Of three trials and more, without the extreme tenths; 1 of fewer. Trials that were
+    left out have no residuals.
+    """
+    by_trial = np.asarray(result.diagnostics.chi_square_by_trial, np.float64)
+    by_trial = by_trial[~np.asarray(result.rejected_trials)]
+    if by_trial.size < 3:
+        return 1.0
+    low, high = np.maximum(np.quantile(by_trial, [0.1, 0.9]), 1e-300)
+    return float(high / low)
+
+
 def _of_record(result: FitResult) -> list[tuple[Any, str]]:
     """Notes on residuals, prior knowledge and saturation, and whether each holds."""
     diagnostics = result.diagnostics
     noise_known = result.problem.options.noise_known
-    by_trial = np.asarray(diagnostics.chi_square_by_trial, np.float64)
+    spread = _spread_of_trials(result)
     size = max(math.sqrt(result.reduced_chi_square), float(np.max(diagnostics.scales)))
     like, sure = diagnostics.whiteness
-    low, high = np.maximum(np.quantile(by_trial, [0.1, 0.9]), 1e-300)
     notes = [
         (
             noise_known and size > 1.3,
@@ -154,8 +167,8 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
             f"{like:.2f}, {sure:.0f} standard deviations from none",
         ),
         (
-            by_trial.size > 2 and high > 4 * low,
-            f"trials differ: chi-square of nine tenths spreads by {high / low:.2g}",
+            spread > 4,
+            f"trials differ: chi-square of nine tenths spreads by {spread:.2g}",
         ),
     ]
     return [*notes, *_of_priors(result), *_of_saturation(result)]
