@@ -14,7 +14,6 @@ from jrigid._checks import RESULTS, is_good
 from jrigid.dynamics import State
 from jrigid.identify import _colour as colour
 from jrigid.identify import _conventions as conventions
-from jrigid.identify import _levels as levels
 from jrigid.identify import _quality as quality
 from jrigid.identify._gyro_errors import GyroErrors, gyro_errors
 from jrigid.identify._independent import (
@@ -22,7 +21,6 @@ from jrigid.identify._independent import (
     condensed_rows,
     independent_rows,
 )
-from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import spectrum, tensors_at
 from jrigid.identify._precision import (
     SHOWN,
@@ -44,13 +42,12 @@ from jrigid.identify._result import (
     spread_of,
 )
 from jrigid.identify._smoother import Rows
+from jrigid.identify._torque_errors import fields_of_torque
 
 HISTORY = 512  # steps whose sums of squares are returned
 _FEWEST = 8  # trials whose scatter says how large errors are
 # Scatter of trials over the errors stated, above which something is missing.
 _DISAGREEING = 3.0
-# Of the level that moves a rate by its noise: where one of zero is judged.
-_TRIED = 0.03
 
 
 class Weakest(NamedTuple):
@@ -113,61 +110,6 @@ def weakest_of(
     direction = np.clip(change, -units, units)
     direction[part] = axes[:, -1] * units[part]
     return float(np.sqrt(max(values[-1], 0.0))), normal, direction
-
-
-def first_level(problem: Problem, layout: Layout, tensor: np.ndarray) -> float:
-    """The level of a torque that moves a rate by its noise from node to node."""
-    span = np.sum(np.where(layout.linked, layout.end - layout.start, 0.0))
-    mean = span / max(np.sum(layout.linked), 1)
-    size = np.trace(tensor) / 3
-    # A white torque of level s changes a rate by s sqrt(t) / I in a time t.
-    return float(problem.noise[0] * size / np.sqrt(mean if mean > 0 else 1.0))
-
-
-def _of_torque(fit: Fit, inflation: float) -> dict[str, np.ndarray]:
-    """Level and correlation time of the unmodelled torque, with errors."""
-    problem = fit.problem
-    none = np.zeros(3)
-    fields = {
-        "level": none,
-        "level_errors": none,
-        "correlation_time": none,
-        "correlation_time_errors": none,
-        "level_by_trial": np.ones(fit.kept.shape[0]),
-    }
-    if not problem.options.dense:
-        return fields
-    first = first_level(problem, fit.layout, fit.minimum.tensor)
-    search = levels.Search(fit.layout, first)
-    torque = fit.torque
-    if torque is None:
-        level = np.asarray(fit.disturbance.level[0], float)
-        time = np.asarray(fit.disturbance.time, float)
-        torque = levels.known(level, time, fit.kept.shape[0])
-    faint = search.are_faint(torque)
-    # The likelihood hardly changes with the logarithm of a faint level, so that errors
-    # are taken at a level that could be seen.
-    tried = torque.with_levels(np.where(faint, _TRIED * first, torque.levels))
-    typical = tried.typical
-    errors = search.errors(tried, fit)
-    of_levels, of_times = np.split(errors, [torque.form.levels])
-    # Near none the likelihood is quadratic in the level squared: the least to be seen.
-    # An error e of the logarithm is an error 2 e of the level squared, relative to it.
-    of_levels = np.where(faint, np.sqrt(2 * of_levels), of_levels)
-    # A level was relative to a noise that was not known.
-    size = 1.0 if problem.options.noise_known else np.sqrt(inflation)
-    level = size * typical.level
-    if fit.torque is not None:
-        level = np.where(search.are_unbounded(tried, of_levels), np.inf, level)
-    fields["level"] = np.where(faint, 0.0, level)
-    fields["level_errors"] = level * of_levels
-    if np.all(faint):
-        return fields
-    fields["correlation_time"] = typical.time
-    fields["level_by_trial"] = np.exp(torque.trials)
-    if torque.form.times:
-        fields["correlation_time_errors"] = typical.time * of_times
-    return fields
 
 
 def derive(
@@ -287,7 +229,7 @@ def conclude(
     judgement = _judgement(fit, known, _white(fit, independent))
     numbers = fit.minimum.point.numbers
     derived = derive(fit.problem, numbers, judgement.covariance, fit.probes)
-    of_torque = _of_torque(fit, judgement.remainder.inflation)
+    of_torque = fields_of_torque(fit, judgement.remainder.inflation)
     fields = derived | of_torque
     fields |= _fields_of_judgement(judgement)
     fields |= _fields_of_precision(fit, known, judgement)

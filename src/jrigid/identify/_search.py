@@ -19,7 +19,7 @@ from jaxtyping import Array
 from jrigid._types import AnyArray
 from jrigid.identify import _levels as levels
 from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
-from jrigid.identify._errors import Weakest, first_level, weakest
+from jrigid.identify._errors import Weakest, weakest
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
@@ -44,6 +44,7 @@ from jrigid.identify._quality import (
 )
 from jrigid.identify._result import LARGEST_ERROR
 from jrigid.identify._smoother import Point
+from jrigid.identify._torque_errors import first_level
 from jrigid.identify._unknowns import Unknowns
 
 # Of the sum of squares, a step is worth: a thousandth of the standard errors.
