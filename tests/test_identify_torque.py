@@ -15,7 +15,9 @@ import jrigid as jr
 from jrigid import identify
 from jrigid.identify import Status
 from jrigid.identify import _disturbance as disturbances
+from jrigid.identify import _errors as errors
 from jrigid.identify import _filter as filters
+from jrigid.identify import _torque_errors as torque_errors
 from jrigid.identify._layout import Layout
 from jrigid.identify._smoother import Links, Rows
 
@@ -263,6 +265,37 @@ def test_errors_stated_are_those_made_where_torques_have_a_memory(fits, rng):
     pulls = off(found)
     # Two numbers of each fit: of 12 fits 1 +- 0.15.
     assert 0.5 < np.sqrt(np.mean(pulls**2)) < 1.6, pulls
+
+
+def test_errors_include_those_of_the_torque(monkeypatch):
+    """They are those of many fits, each given a torque that is as likely as the record
+    says."""
+    rng = np.random.default_rng(0)
+    (record,) = some_trials(rng, 1)
+    fits = []
+
+    def caught(fit):
+        fits.append(fit)
+        return torque_errors.added_by_torque(fit)
+
+    monkeypatch.setattr(errors, "added_by_torque", caught)
+    found = identify.fit(BLIND, record, unmodelled="estimate")
+    sought = torque_errors.sought_torque(fits[-1])
+    assert np.max(np.diagonal(sought.covariance)) < 1  # not bounded by what is known
+    half = np.linalg.cholesky(sought.covariance)
+
+    def given(numbers):
+        torque = sought.torque._replace(numbers=numbers).typical
+        fit = identify.fit(BLIND, record, unmodelled=torque)
+        return np.asarray(fit.ratios), np.asarray(fit.ratios_errors)
+
+    _, at_best = given(sought.torque.numbers)
+    draws = half @ rng.normal(size=(half.shape[0], 30))
+    pairs = np.array([given(sought.torque.numbers + x) for x in draws.T])
+    variances = np.var(pairs[:, 0], axis=0) + np.mean(pairs[:, 1] ** 2, axis=0)
+    total = np.sqrt(variances)
+    assert np.all(at_best < 0.9 * total)
+    np.testing.assert_allclose(found.ratios_errors, total, rtol=0.1)
 
 
 def test_a_torque_that_is_given_is_used(rng):

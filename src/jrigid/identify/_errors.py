@@ -42,7 +42,7 @@ from jrigid.identify._result import (
     spread_of,
 )
 from jrigid.identify._smoother import Rows
-from jrigid.identify._torque_errors import fields_of_torque
+from jrigid.identify._torque_errors import added_by_torque, fields_of_torque
 
 HISTORY = 512  # steps whose sums of squares are returned
 _FEWEST = 8  # trials whose scatter says how large errors are
@@ -630,6 +630,7 @@ def _inflated(
     units = fit.minimum.units
     factors = np.maximum(scatter, 1.0)
     covariance = inflation * _with_larger_errors(known, factors, units)
+    covariance = covariance + inflation * added_by_torque(fit)
     if fit.probes:
         judged = fit.problem.unknowns.judged
         probed = max(x.error for x in fit.probes)

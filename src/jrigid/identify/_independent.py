@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jrigid.identify import _quality as quality
+from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._filter import innovations
 from jrigid.identify._quality import Fit
 from jrigid.identify._smoother import Links, Rows
@@ -64,7 +65,13 @@ def independent_rows(fit: Fit) -> Independent:
     minimum = fit.minimum
     if not fit.problem.options.dense:
         return Independent(condensed_rows(fit), minimum.weight, 0.0)
-    filtered = innovations(quality.linearised(fit), fit.disturbance)
+    return innovations_under(fit, fit.disturbance)
+
+
+def innovations_under(fit: Fit, disturbance: Disturbance) -> Independent:
+    """The innovations of a fit if this torque acted, those of prior knowledge last."""
+    minimum = fit.minimum
+    filtered = innovations(quality.linearised(fit), disturbance)
     columns = np.concatenate(
         [np.asarray(filtered.rows), quality.columns_of_prior(fit)], axis=1
     )

@@ -268,7 +268,7 @@ class Search:
         """The most likely torque of the same form, with the same sizes in trials."""
         return self._descended(torque, Likelihood(fit))
 
-    def _bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
+    def bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the numbers of a form."""
         counts = [form.levels, form.times]
         low = np.repeat([self._first + np.log(FAINT), self._shortest], counts)
@@ -277,7 +277,7 @@ class Search:
 
     def _descended(self, torque: Torque, likelihood: Likelihood) -> Torque:
         """The most likely torque of the same form, searched from a torque."""
-        low, high = self._bounds(torque.form)
+        low, high = self.bounds(torque.form)
 
         def function(x: np.ndarray) -> tuple[float, np.ndarray]:
             return likelihood(torque.form, x, torque.trials)[:2]
@@ -345,7 +345,7 @@ class Search:
         size = torque.form.size
         trials = torque.trials.size
         function = _with_sizes(torque, likelihood)
-        low, high = self._bounds(torque.form)
+        low, high = self.bounds(torque.form)
         low = np.concatenate([low, np.full(trials, -_HIGHEST)])
         high = np.concatenate([high, np.full(trials, _HIGHEST)])
         start = np.concatenate([torque.numbers, np.zeros(trials)])
@@ -381,8 +381,8 @@ class Search:
         most = used.size * _MOST_FOREIGN
         return foreign if np.sum(foreign | ~used) <= most else none
 
-    def errors(self, torque: Torque, fit: Fit) -> np.ndarray:
-        """Standard errors of the logarithms of levels and times."""
+    def covariance(self, torque: Torque, fit: Fit) -> np.ndarray:
+        """Covariance of the logarithms of levels and times."""
         likelihood = Likelihood(fit)
 
         def slope(numbers: np.ndarray) -> np.ndarray:
@@ -397,8 +397,7 @@ class Search:
         finite = np.where(np.isfinite(curvature), curvature, 0.0)
         values, axes = np.linalg.eigh(finite)
         # The value is twice the logarithm.
-        covariance = (axes * (2 / np.maximum(values, 1e-12))) @ axes.T
-        return np.sqrt(np.diagonal(covariance))
+        return (axes * (2 / np.maximum(values, 1e-12))) @ axes.T
 
 
 def _with_sizes(torque: Torque, likelihood: Likelihood) -> Function:
