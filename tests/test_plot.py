@@ -440,7 +440,11 @@ def test_about_the_vertical_a_top_keeps_its_momentum():
 
 
 def faces_of(ax):
-    return np.reshape(ax.collections[0]._faces, (-1, 3))
+    """Corners of the faces in space, to which matplotlib has no public way."""
+    surface = ax.collections[0]
+    if hasattr(surface, "_faces"):
+        return np.reshape(surface._faces, (-1, 3))
+    return surface._vec[:3].T  # matplotlib before 3.11
 
 
 def test_the_box_drawn_has_the_inertia():
