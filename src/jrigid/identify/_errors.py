@@ -291,9 +291,7 @@ def _fields_of_precision(
     sensors = known
     if fit.problem.options.dense:
         # What the sensors alone would determine, without an unmodelled torque.
-        rows = condensed_rows(fit)
-        own = minimum.point.own.shape[-1]
-        of_sensors = without_states(rows, minimum.weight, own, minimum.units)
+        of_sensors = without_states(fit, condensed_rows(fit), minimum.weight)
         sensors = precision_of(of_sensors, minimum.units)
     inflation = judgement.remainder.inflation
     return {

@@ -85,17 +85,16 @@ class Reduced(NamedTuple):
         return columns - basis @ (np.swapaxes(basis, 1, 2) @ columns)
 
 
-def without_states(
-    rows: Rows, weight: np.ndarray, own: int, units: np.ndarray
-) -> Reduced:
+def without_states(fit: Fit, rows: Rows, weight: np.ndarray) -> Reduced:
     """Rows as the numbers alone move them.
 
     Args:
+        fit: Where the rows were computed.
         rows: In the first state of each trial, own numbers and numbers.
         weight: Of each row.
-        own: How many own numbers a trial has.
-        units: Natural units of the numbers.
     """
+    own = fit.minimum.point.own.shape[-1]
+    units = fit.minimum.units
     root = np.sqrt(weight)[..., None]
     trials, count, width = rows.residual.shape
     flat = (trials, count * width)
@@ -177,9 +176,8 @@ def least_value(dtype: np.dtype) -> float:
 @quality.once_for_each_fit
 def reduced(fit: Fit) -> Reduced:
     """Independent rows of a fit, without what changes of the states can do."""
-    own = fit.minimum.point.own.shape[-1]
     rows, weight, _ = independent_rows(fit)
-    return without_states(rows, weight, own, fit.minimum.units)
+    return without_states(fit, rows, weight)
 
 
 @quality.once_for_each_fit

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jrigid._numerics import product
+from jrigid._numerics import or_one, product
 from jrigid._types import AnyArray
 from jrigid.rotation import exp, multiply, normalize
 
@@ -249,9 +249,8 @@ def solve_positive(matrix: Array, columns: Array) -> tuple[Array, Array]:
         Solutions (n, k), and the logarithm of the determinant.
     """
     # Unit diagonal, since rates, turns and numbers have different units.
-    diagonal = jnp.diagonal(matrix)
     # A trial that was left out has zeros, where the root has no derivative.
-    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    size = jnp.sqrt(or_one(jnp.diagonal(matrix)))
     scaled = matrix / size[:, None] / size[None, :]
     eye = jnp.eye(size.size, dtype=size.dtype)
     # Rounding must not make a nearly singular matrix indefinite.

@@ -9,7 +9,12 @@ from jrigid.identify import _quality as quality
 from jrigid.identify._disturbance import Disturbance
 from jrigid.identify._independent import innovations_under
 from jrigid.identify._layout import Layout
-from jrigid.identify._precision import precision_of, without_states
+from jrigid.identify._precision import (
+    Precision,
+    precision,
+    precision_of,
+    without_states,
+)
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import Fit
 
@@ -125,28 +130,28 @@ def added_by_torque(fit: Fit) -> np.ndarray:
     count = variances.size
     # With as many axes as numbers the mean over these points has the right variance.
     moves = np.sqrt(count * np.minimum(variances, _LARGEST**2)) * axes
-    estimate, covariance = _under(fit, torque)
+    found = precision(fit)
     added = none
     for move in (*moves.T, *-moves.T):
-        other = torque._replace(numbers=np.clip(torque.numbers + move, low, high))
-        other_estimate, other_covariance = _under(fit, other)
-        shift = other_estimate - estimate
-        change = other_covariance - covariance + np.outer(shift, shift)
+        numbers = np.clip(torque.numbers + move, low, high)
+        other = _precision_under(fit, torque._replace(numbers=numbers))
+        shift = _to_best(other) - _to_best(found)
+        change = other.covariance - found.covariance + np.outer(shift, shift)
         added = added + change / (2 * count)
     return _without_negative(added, units) if np.all(np.isfinite(added)) else none
 
 
-def _under(fit: Fit, torque: levels.Torque) -> tuple[np.ndarray, np.ndarray]:
-    """Change of the numbers from a fit to the best ones under a torque; covariance."""
-    minimum = fit.minimum
-    dtype = minimum.units.dtype
-    disturbance = Disturbance(*(np.asarray(x, dtype) for x in torque.disturbance))
+def _precision_under(fit: Fit, torque: levels.Torque) -> Precision:
+    """What a fit would determine of the numbers if this torque acted."""
+    units = fit.minimum.units
+    disturbance = Disturbance(*(np.asarray(x, units.dtype) for x in torque.disturbance))
     rows, weight, _ = innovations_under(fit, disturbance)
-    own = minimum.point.own.shape[-1]
-    found = precision_of(
-        without_states(rows, weight, own, minimum.units), minimum.units
-    )
-    return -found.covariance @ np.sum(found.scores, axis=0), found.covariance
+    return precision_of(without_states(fit, rows, weight), units)
+
+
+def _to_best(known: Precision) -> np.ndarray:
+    """Change of the numbers from a fit to the best ones by these rows."""
+    return -known.covariance @ np.sum(known.scores, axis=0)
 
 
 def _without_negative(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
