@@ -464,7 +464,9 @@ def search(case: Case) -> Search:
         rival = apart and abs(fall) < _RIVAL
         ambiguous = few or rival or (ambiguous and not (better and fall > _RIVAL))
         if better:
-            best, wrong, weak = other, other_wrong, other_weak
+            best = other
+            wrong = other_wrong
+            weak = other_weak
         index += 1
     best = dataclasses.replace(best, ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
