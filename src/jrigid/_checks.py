@@ -24,6 +24,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jrigid._core.compile import quick_jit
 from jrigid._core.third_party import (
     EnumerationMeta,
     code_of,
@@ -567,7 +568,7 @@ def settle(
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _diagnosis(
     findings: Callable[..., Findings], bad: Array, result: RESULTS, *arguments: Any
 ) -> _Diagnosis:

@@ -28,6 +28,7 @@ from jrigid._checks import (
     settle,
     where_defined,
 )
+from jrigid._core.compile import quick_jit
 from jrigid._core.third_party import used_inputs
 from jrigid._numerics import safe_norm
 from jrigid._types import BodyState
@@ -282,7 +283,7 @@ def _motion_findings(
     return findings
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@quick_jit
 def _exact_states(
     check: Check, flow: Flow, body: PyTree, state0: State, ts: Array, t0: Array
 ) -> ExactStates:

@@ -15,6 +15,7 @@ from jrigid._checks import (
     shaped,
     state_array,
 )
+from jrigid._core.compile import one_program
 from jrigid._public import list_public_names
 from jrigid._types import InertiaLike, Readable, Scalar, Vector, VectorLike
 
@@ -119,6 +120,7 @@ def _inverse_times(inertia: Array, vector: Array) -> Array:
     return jnp.stack(rows) / determinant
 
 
+@one_program
 def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     """Angular momentum I omega, body components.
 
@@ -140,6 +142,7 @@ def angular_momentum(inertia: InertiaLike, omega: VectorLike) -> Vector:
     return jnp.stack(_inertia_times(*_inertia_and_vector(inertia, omega)))
 
 
+@one_program
 def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Rotational kinetic energy, omega . I omega / 2.
 
@@ -161,6 +164,7 @@ def kinetic_energy(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return 0.5 * (w[0] * a + w[1] * b + w[2] * c)
 
 
+@one_program
 def euler_equations(
     inertia: InertiaLike, omega: VectorLike, torque: VectorLike | None = None
 ) -> Vector:
@@ -212,6 +216,7 @@ def _momentum_cross_omega(inertia: Array, omega: Array) -> Array:
     return jnp.stack([q * c - r * b, r * a - p * c, p * b - q * a])
 
 
+@one_program
 def bearing_torque(inertia: InertiaLike, omega: VectorLike) -> Vector:
     """Torque of the supports that keep a rotation steady: omega x (I omega).
 

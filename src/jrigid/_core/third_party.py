@@ -14,6 +14,8 @@ import equinox as eqx
 import jax
 import numpy as np
 from equinox.internal import unvmap_any as unvmap_any
+from jax._src.core import EvalTrace, trace_ctx
+from jax._src.interpreters.batching import BatchTrace
 from jax.extend import core
 from jax.interpreters import ad as ad
 from jax.interpreters import batching, partial_eval
@@ -104,6 +106,17 @@ jaxpr_as_fun = core.jaxpr_as_fun
 
 #: The parameters of an operation, by their names.
 Parameters = dict[str, Any]
+
+
+def outside_of_jit() -> bool:
+    """Whether values are known at this place: nothing is compiled or differentiated.
+
+    Under `jax.vmap` alone the values of all lanes are known.
+    """
+    trace = trace_ctx.trace
+    while isinstance(trace, BatchTrace):
+        trace = trace.parent_trace
+    return isinstance(trace, EvalTrace)
 
 
 def shape_of(variable: Any) -> tuple[int, ...]:

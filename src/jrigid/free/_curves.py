@@ -1,5 +1,6 @@
 """Polhode and herpolhode, separatrix, and Poinsot's surfaces."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import where_defined, whole_number
+from jrigid._core.compile import one_program, quick_jit
 from jrigid._numerics import safe_norm
 from jrigid._spectral import eigh
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
@@ -54,27 +56,30 @@ def polhode(
     [-0.1  0.   1. ]
     """
     count = whole_number("points", points, 2)
-
-    def curve(inertia: Array, omega: Array) -> Array:
-        motion = invariants(*in_principal_axes(inertia, omega))
-        square = motion.kap + motion.v
-        # On the separatrix the angular momentum approaches the axis as exp(-sqrt(Q) t),
-        # with Q = kap + v.
-        endless = _ENDLESS_PHASE / jnp.sqrt(jnp.where(square > 0, square, 1.0))
-        end = jnp.where(motion.circles, 4 * motion.quarter, endless)
-        start = jnp.where(motion.circles, 0.0, -end)
-        # The invariants are in units in which rates are of order one.
-        times = jnp.linspace(start, end, count) / motion.unit
-
-        def at_time(t: Array) -> Array:
-            _, omega_then = relative_rotation(inertia, omega, t)
-            return omega_then
-
-        return jax.vmap(at_time)(times)
-
-    return where_moving(curve, inertia, omega=omega)
+    return where_moving(partial(_polhode, count), inertia, omega=omega)
 
 
+@quick_jit  # outside of jit each operation is a program of its own
+def _polhode(count: int, inertia: Array, omega: Array) -> Float[Array, "{count} 3"]:
+    """The curve of `polhode`."""
+    motion = invariants(*in_principal_axes(inertia, omega))
+    square = motion.kap + motion.v
+    # On the separatrix the angular momentum approaches the axis as exp(-sqrt(Q) t),
+    # with Q = kap + v.
+    endless = _ENDLESS_PHASE / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    end = jnp.where(motion.circles, 4 * motion.quarter, endless)
+    start = jnp.where(motion.circles, 0.0, -end)
+    # The invariants are in units in which rates are of order one.
+    times = jnp.linspace(start, end, count) / motion.unit
+
+    def at_time(t: Array) -> Array:
+        _, omega_then = relative_rotation(inertia, omega, t)
+        return omega_then
+
+    return jax.vmap(at_time)(times)
+
+
+@one_program
 def herpolhode(
     inertia: InertiaLike,
     state0: State,
@@ -131,6 +136,7 @@ class Separatrix(NamedTuple):
     omega_angle: Scalar
 
 
+@one_program
 def separatrix(inertia: InertiaLike) -> Separatrix:
     """Position of the separatrix; I1 < I2 < I3 are the ascending moments.
 
@@ -192,6 +198,7 @@ class Poinsot(NamedTuple):
     plane_distance: Scalar
 
 
+@one_program
 def poinsot(inertia: InertiaLike, omega: VectorLike) -> Poinsot:
     """Poinsot's sphere, ellipsoids and invariable plane.
 

@@ -18,6 +18,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._core.lanes import as_lanes, some_at_a_time
 from jrigid._core.third_party import unvmap_any
 from jrigid._motion import exact_motion, plain_state
@@ -105,6 +106,7 @@ def _flow(inertia: Array, state0: State, t: Array) -> tuple[Array, Array]:
     return multiply(normalize(state0.attitude), turn), omega
 
 
+@one_program
 def relative_rotation(
     inertia: InertiaLike, omega: VectorLike, duration: ScalarLike
 ) -> tuple[Quaternion, Vector]:

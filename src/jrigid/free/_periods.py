@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from jrigid._checks import Enumeration
+from jrigid._core.compile import one_program
 from jrigid._numerics import root_of_positive, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
 from jrigid.free._free_rotation import from_invariants
@@ -26,6 +27,7 @@ class REGIMES(Enumeration):
     )
 
 
+@one_program
 def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Period of the angular velocity of a free body, in the body.
 
@@ -56,6 +58,7 @@ def polhode_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return from_invariants(period, inertia, omega)
 
 
+@one_program
 def mean_precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Mean rate at which a free body precesses about its momentum in space.
 
@@ -96,6 +99,7 @@ def _mean_rate(motion: Invariants) -> Scalar:
     return safe_norm(jnp.stack(motion.momentum)) * over_momentum
 
 
+@one_program
 def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Angle by which a free body turns about its momentum in one polhode period.
 
@@ -125,6 +129,7 @@ def precession_per_period(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return from_invariants(angle, inertia, omega)
 
 
+@one_program
 def geometric_phase(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Part of `precession_per_period` beyond the dynamic phase 2 E T / |L|.
 
@@ -165,6 +170,7 @@ def _geometric_phase(motion: Invariants) -> Scalar:
     return jnp.where(motion.circles, phase, 0.0)
 
 
+@one_program
 def parameter(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Parameter m = k^2 of the Jacobi functions of the motion; 1 on the separatrix.
 
@@ -198,6 +204,7 @@ def _parameter(motion: Invariants) -> Scalar:
     return jnp.where(q > 0, p / jnp.where(q > 0, q, 1.0), 0.0)
 
 
+@one_program
 def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Modulus k of the Jacobi functions of the motion, from 0 to 1 on the separatrix.
 
@@ -220,6 +227,7 @@ def modulus(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return from_invariants(lambda x: root_of_positive(_parameter(x)), inertia, omega)
 
 
+@one_program
 def regime(inertia: InertiaLike, omega: VectorLike) -> REGIMES:
     """Kind of a free rotation.
 

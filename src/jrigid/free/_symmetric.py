@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._checks import where_defined
+from jrigid._core.compile import one_program
 from jrigid._numerics import safe_arctan2, safe_norm
 from jrigid._types import InertiaLike, Scalar, VectorLike
 from jrigid.free._free_rotation import where_moving
@@ -57,6 +58,7 @@ def _where_symmetric(
     return where_moving(of_body, inertia, omega=omega)
 
 
+@one_program
 def wobble_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Rate at which the pole of a symmetric body turns in the body, (I3/I1 - 1) omega3.
 
@@ -82,6 +84,7 @@ def wobble_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return _where_symmetric(lambda i1, i3, w: (i3 - i1) / i1 * w[2], inertia, omega)
 
 
+@one_program
 def precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Rate |L| / I1 at which the axis of a symmetric body precesses in space.
 
@@ -109,6 +112,7 @@ def precession_rate(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     return _where_symmetric(rate, inertia, omega)
 
 
+@one_program
 def cone_angles(inertia: InertiaLike, omega: VectorLike) -> ConeAngles:
     """Angles between axis, angular velocity and momentum of a symmetric body.
 

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import INERTIA, check_shape, check_type, demand, nan_where
+from jrigid._core.compile import Static, program, small_jit
 from jrigid._numerics import or_one, product
 from jrigid._types import AnyArray, Matrix, Readable, Real, Scalar
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.identify import _problem as problems
-from jrigid.identify._compile import Static, program, small_jit
 from jrigid.identify._disturbance import no_disturbance
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import needs_attitude

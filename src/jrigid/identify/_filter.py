@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jrigid._core.compile import program, small_program
 from jrigid._numerics import product
 from jrigid._types import AnyArray
-from jrigid.identify._compile import program, small_program
 from jrigid.identify._disturbance import Disturbance, Push, push_of, with_torque
 from jrigid.identify._layout import Layout
 from jrigid.identify._smoother import Links, Rows, solve_positive

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jrigid._core.compile import SOME, quick_jit
 from jrigid._numerics import product
 from jrigid._types import Matrix, Scalar
-from jrigid.identify._compile import quick_jit
 
 # The path from the estimate goes 6.4 standard errors to each side.
 _STEP = 0.4
@@ -166,7 +166,7 @@ def _error_and_curvature(values: Array, offsets: Array) -> tuple[Array, Array]:
     return error, jnp.sqrt(jnp.mean(deviation**2))
 
 
-@quick_jit
+@partial(quick_jit, level=SOME)
 def interval(
     function: Callable[[Matrix], Scalar],
     tensor: Matrix,

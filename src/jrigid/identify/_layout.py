@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jrigid._core.compile import Static, small_program
 from jrigid._types import AnyArray
-from jrigid.identify._compile import Static, small_program
 from jrigid.identify._host import conjugate, exp, log, multiply, normalize
 from jrigid.identify._records import Record, Samples, first_and_last, tells
 from jrigid.identify._sensors import AbstractSensor

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from jrigid._core.compile import program, small_program
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import AnyArray
-from jrigid.identify._compile import program, small_program
 from jrigid.identify._disturbance import Disturbance, Push, push_of, with_torque
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem, evaluation

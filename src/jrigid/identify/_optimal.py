@@ -19,9 +19,9 @@ from jrigid._checks import (
     is_concrete,
     whole_number,
 )
+from jrigid._core.compile import SOME, quick_jit
 from jrigid._numerics import or_one
 from jrigid._types import Scalar
-from jrigid.identify._compile import quick_jit
 from jrigid.identify._design import Bound, Plan
 
 _FIRST_STEP = 0.1  # in units of the limits, along a gradient of length 1
@@ -320,7 +320,7 @@ def _descended(
     return jax.lax.scan(step, initial, None, steps)
 
 
-@quick_jit
+@partial(quick_jit, level=SOME)
 def _optimum(
     plan: Plan,
     choose: Callable[[Plan], Any],

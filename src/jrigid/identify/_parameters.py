@@ -14,6 +14,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._numerics import product
 from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
 from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
@@ -41,6 +42,7 @@ def squared(
     return product("ik,jk->ij", factor, factor)
 
 
+@one_program
 def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
     """Return the inertia tensor of a real body from six unbounded numbers.
 
@@ -81,6 +83,7 @@ def inertia_from_parameters(parameters: Real[ArrayLike, "6"]) -> Matrix:
     return where_defined(all_finite(parameters), tensor, parameters)
 
 
+@one_program
 def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     """Return six unbounded numbers for the inertia of a real body.
 
@@ -120,6 +123,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
     return where_defined(solid, numbers, second)
 
 
+@one_program
 def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     """Return the mass properties of a real body from its ten log-Cholesky numbers.
 
@@ -157,6 +161,7 @@ def body_from_log_cholesky(parameters: Real[ArrayLike, "10"]) -> MassProperties:
     )
 
 
+@one_program
 def log_cholesky_from_body(body: MassProperties) -> Float[Array, "10"]:
     """Return the ten log-Cholesky numbers of a body.
 

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jrigid._core.compile import small_program
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
-from jrigid.identify._compile import small_program
 from jrigid.identify._flow import forced_flow
 from jrigid.identify._host import conjugate, log, multiply
 from jrigid.identify._layout import Layout

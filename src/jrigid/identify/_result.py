@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import Enumeration, demand, float_arrays, is_concrete, kind_of
+from jrigid._core.compile import small_jit
 from jrigid._core.third_party import with_codes
 from jrigid._numerics import product
 from jrigid._spectral import eigh
 from jrigid._types import AnyArray, Matrix, Real, Scalar, Vector
 from jrigid.dynamics import State
-from jrigid.identify._compile import small_jit
 from jrigid.identify._diagnostics import Diagnostics
 from jrigid.identify._intervals import interval
 from jrigid.identify._problem import Problem, as_read, shown_by

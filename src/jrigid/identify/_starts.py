@@ -24,11 +24,11 @@ from jrigid._checks import (
     shaped,
     whole_number,
 )
+from jrigid._core.compile import small_program
 from jrigid._numerics import or_one, product, rms
 from jrigid._types import AnyArray, Matrix, Readable, Real, Vector
 from jrigid.dynamics import State
 from jrigid.identify import _host as host
-from jrigid.identify._compile import small_program
 from jrigid.identify._inertia_models import LogCholesky
 from jrigid.identify._layout import DirectReadings
 from jrigid.identify._problem import Options

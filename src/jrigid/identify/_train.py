@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jrigid._checks import all_finite, check_key, check_type, demand, whole_number
+from jrigid._core.compile import SOME, quick_jit
 from jrigid._numerics import product
 from jrigid._stepping.method import method_of
 from jrigid._types import AnyArray, RandomKey
 from jrigid.dynamics import State
-from jrigid.identify._compile import quick_jit
 from jrigid.identify._flow import forced_flow, needs_attitude
 from jrigid.identify._host import on_host
 from jrigid.identify._inputs import judge
@@ -458,7 +458,7 @@ def _print_losses(epoch: int, after: _AfterEpoch) -> None:
     print(f"epoch {epoch}: {losses}", flush=True)
 
 
-@quick_jit
+@partial(quick_jit, level=SOME)
 def _epoch(task: _Task, params: PyTree, memory: PyTree, key: Array) -> _AfterEpoch:
     """Take one step of the optimiser for each batch of segments."""
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jrigid._checks import INERTIA, shaped
+from jrigid._core.compile import one_program
 from jrigid._types import InertiaLike, Matrix, ScalarLike
 from jrigid.mass import (
     MassProperties,
@@ -180,6 +181,7 @@ def diagnose(body: MassProperties | InertiaLike) -> tuple[str, ...]:
     return faults(*known) or doubts(*known)
 
 
+@one_program
 def nearest_physical(
     inertia: InertiaLike, mass: ScalarLike = 0.0, thickness: ScalarLike = 0.0
 ) -> Matrix:

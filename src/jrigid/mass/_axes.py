@@ -18,6 +18,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._spectral import eigh, spectral_function
 from jrigid._types import (
     InertiaLike,
@@ -149,6 +150,7 @@ def _can_be_displaced(
     return is_symmetric(tensor) & (mass >= 0) & all_finite((mass, displacement))
 
 
+@one_program
 def parallel_axis(
     inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike
 ) -> Matrix:
@@ -178,6 +180,7 @@ def parallel_axis(
     return where_defined(ok, _from_center, *arguments)
 
 
+@one_program
 def to_center_of_mass(
     inertia: InertiaLike, mass: ScalarLike, displacement: VectorLike
 ) -> Matrix:
@@ -226,6 +229,7 @@ class PrincipalAxes(Readable):
     axes: Float[Array, "3 3"]
 
 
+@one_program
 def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
     """Principal moments and axes of an inertia tensor; NaN where it is not symmetric.
 

@@ -1,12 +1,12 @@
 """The brightness of a body in a state, and of a free body as it turns."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jrigid._checks import RESULTS, demand, is_concrete, nan_where, shaped
+from jrigid._core.compile import quick_jit
 from jrigid._numerics import product, safe_arctan2, safe_norm
 from jrigid._types import InertiaLike, Real, Scalar, ScalarLike, Vector, VectorLike
 from jrigid.dynamics import State
@@ -55,7 +55,7 @@ def brightness(
     return _brightness(shape, scattering, to_sun, to_observer)
 
 
-@eqx.filter_jit  # outside of jit each operation is a program of its own
+@quick_jit  # outside of jit each operation is a program of its own
 def _brightness(
     shape: Facets | Ellipsoid,
     scattering: AbstractScattering,
@@ -159,7 +159,7 @@ def light_curve(
     return _seen_from_space(shape, scattering, attitude, to_sun, to_observer, ok)
 
 
-@eqx.filter_jit  # outside of jit each operation is a program of its own
+@quick_jit  # outside of jit each operation is a program of its own
 def _seen_from_space(
     shape: Facets | Ellipsoid,
     scattering: AbstractScattering,

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import check_option, demand
+from jrigid._core.compile import quick_jit
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
@@ -173,7 +173,7 @@ def _in_blocks(function: Callable[..., Array], *arrays: np.ndarray) -> np.ndarra
     return np.concatenate(done)[:count]
 
 
-@eqx.filter_jit
+@quick_jit
 def _state_of(tumbler: Tumbler) -> State:
     """The state at time 0."""
     return tumbler.state
@@ -185,7 +185,7 @@ def _attitudes(moments: Array, state: State, ts: Array) -> Float[Array, "epochs 
     return free_rotation(moments, state, ts, throw=False).attitude
 
 
-@eqx.filter_jit
+@quick_jit
 def _brightness(
     shape: Ellipsoid | Facets,
     scattering: AbstractScattering,

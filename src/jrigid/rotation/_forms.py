@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jrigid._checks import array_of_shape, where_defined
+from jrigid._core.compile import one_program
 from jrigid._numerics import product, safe_arctan2, safe_norm
 from jrigid._types import (
     Matrix,
@@ -23,6 +24,7 @@ from jrigid.rotation._quaternion import multiply, normalize, rescaled, rotate
 _ORTHOGONAL = 1e-3
 
 
+@one_program
 def hat(vector: VectorLike) -> Matrix:
     """Skew matrix with `hat(a) b = a x b`.
 
@@ -46,6 +48,7 @@ def hat(vector: VectorLike) -> Matrix:
     )
 
 
+@one_program
 def vee(matrix: MatrixLike) -> Vector:
     """Vector of the skew-symmetric part of a matrix: `vee(hat(a)) = a`.
 
@@ -65,6 +68,7 @@ def vee(matrix: MatrixLike) -> Vector:
     return 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
 
 
+@one_program
 def to_matrix(attitude: QuaternionLike) -> Matrix:
     """Rotation matrix R with `v_space = R v_body`.
 
@@ -86,6 +90,7 @@ def to_matrix(attitude: QuaternionLike) -> Matrix:
     return jax.vmap(rotate, in_axes=(None, 1), out_axes=1)(q, jnp.eye(3, dtype=q.dtype))
 
 
+@one_program
 def from_matrix(matrix: MatrixLike) -> Quaternion:
     """Unit quaternion, with w >= 0, of a rotation matrix.
 
@@ -200,6 +205,7 @@ def from_scipy(rotation: QuaternionLike | _ScipyRotation) -> Quaternion:
         ) from error
 
 
+@one_program
 def from_euler(angles: VectorLike) -> Quaternion:
     """Attitude of z-x-z Euler angles: `R = Rz(phi) Rx(theta) Rz(psi)`.
 
@@ -225,6 +231,7 @@ def from_euler(angles: VectorLike) -> Quaternion:
     )
 
 
+@one_program
 def to_euler(attitude: QuaternionLike) -> Vector:
     """z-x-z Euler angles of an attitude.
 
@@ -265,6 +272,7 @@ def _wrap(angle: Array) -> Array:
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
+@one_program
 def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     """Attitude of roll, pitch and yaw: `R = Rz(yaw) Ry(pitch) Rx(roll)`, body to space.
 
@@ -300,6 +308,7 @@ def from_roll_pitch_yaw(angles: VectorLike) -> Quaternion:
     )
 
 
+@one_program
 def to_roll_pitch_yaw(attitude: QuaternionLike) -> Vector:
     """Roll, pitch and yaw of an attitude, as `from_roll_pitch_yaw` takes them.
 

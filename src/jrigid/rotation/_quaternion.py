@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, PRNGKeyArray
 
 from jrigid._checks import array_of_shape, shaped, where_defined
+from jrigid._core.compile import one_program
 from jrigid._numerics import (
     arctanc_sqrt,
     cos_sqrt,
@@ -89,6 +90,7 @@ def random(key: PRNGKeyArray, dtype: DTypeLike | None = None) -> Quaternion:
     return normalize(jax.random.normal(key, (4,), _dtype(dtype)))
 
 
+@one_program
 def normalize(quaternion: QuaternionLike) -> Quaternion:
     """Quaternion scaled to norm 1; the zero quaternion stays zero, with gradient zero.
 
@@ -118,6 +120,7 @@ def _direction(vector: Array) -> Array:
     return jnp.where(is_zero, jnp.zeros_like(vector), vector / norm)
 
 
+@one_program
 def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
     """Hamilton product p q: `R(p q) = R(p) R(q)`, q is applied first.
 
@@ -146,6 +149,7 @@ def multiply(p: QuaternionLike, q: QuaternionLike) -> Quaternion:
     )
 
 
+@one_program
 def conjugate(quaternion: QuaternionLike) -> Quaternion:
     """Conjugate; for a unit quaternion the inverse rotation.
 
@@ -165,6 +169,7 @@ def conjugate(quaternion: QuaternionLike) -> Quaternion:
     return jnp.stack([w, -x, -y, -z])
 
 
+@one_program
 def inverse(quaternion: QuaternionLike) -> Quaternion:
     """The quaternion that, multiplied with the one given, makes the identity.
 
@@ -195,6 +200,7 @@ def _spans(quaternion: Array) -> Array:
     return jnp.any(quaternion != 0) & jnp.all(jnp.isfinite(quaternion))
 
 
+@one_program
 def rotate(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     """Space components of a vector given in body components.
 
@@ -244,6 +250,7 @@ def _rotated(w: Array, x: Array, y: Array, z: Array, vector: Array) -> Vector:
     )
 
 
+@one_program
 def rotate_inverse(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     """Body components of a vector given in space components.
 
@@ -266,6 +273,7 @@ def rotate_inverse(attitude: QuaternionLike, vector: VectorLike) -> Vector:
     return _rotated(w, -x, -y, -z, vector)
 
 
+@one_program
 def exp(rotation_vector: VectorLike) -> Quaternion:
     """Quaternion of a rotation vector: axis times angle.
 
@@ -287,6 +295,7 @@ def exp(rotation_vector: VectorLike) -> Quaternion:
     return jnp.concatenate([cos_sqrt(z)[None], 0.5 * sinc_sqrt(z) * v])
 
 
+@one_program
 def log(attitude: QuaternionLike) -> Vector:
     """Rotation vector, of length at most pi, of a quaternion.
 
@@ -323,6 +332,7 @@ def log(attitude: QuaternionLike) -> Vector:
     return 2 * jnp.where(is_zero, 0.0, half) * v
 
 
+@one_program
 def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     """Angle of the rotation that takes attitude p to attitude q.
 
@@ -347,6 +357,7 @@ def angle_between(p: QuaternionLike, q: QuaternionLike) -> Scalar:
     return safe_norm(log(multiply(rescaled(conjugate(p)), rescaled(q))))
 
 
+@one_program
 def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
     """Spherical linear interpolation from p to q along the shortest arc.
 
@@ -385,6 +396,7 @@ def slerp(p: QuaternionLike, q: QuaternionLike, s: ScalarLike) -> Quaternion:
     return where_defined(_spans(p) & _spans(q), formula, p, q, s)
 
 
+@one_program
 def from_axis_angle(axis: VectorLike, angle: ScalarLike) -> Quaternion:
     """Attitude turned by an angle about an axis.
 

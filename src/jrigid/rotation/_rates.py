@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import all_finite, is_unit, shaped, where_defined
+from jrigid._core.compile import one_program
 from jrigid._types import (
     MatrixLike,
     Quaternion,
@@ -19,6 +20,7 @@ from jrigid.rotation._forms import vee
 from jrigid.rotation._quaternion import exp, multiply, normalize
 
 
+@one_program
 def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     """Time derivative of the attitude quaternion: q' = q (0, omega) / 2.
 
@@ -49,6 +51,7 @@ def attitude_rate(attitude: QuaternionLike, omega: VectorLike) -> Quaternion:
     )
 
 
+@one_program
 def angular_velocity(rotation: MatrixLike, rotation_rate: MatrixLike) -> Vector:
     """Angular velocity in body components from a rotation matrix and its rate.
 
@@ -75,6 +78,7 @@ def angular_velocity(rotation: MatrixLike, rotation_rate: MatrixLike) -> Vector:
     return vee(jnp.sum(r[:, :, None] * dr[:, None, :], axis=0))
 
 
+@one_program
 def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     """Body components of the angular velocity from z-x-z Euler angles and their rates.
 
@@ -107,6 +111,7 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
     )
 
 
+@one_program
 def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """Rates of the z-x-z Euler angles from the angular velocity in body components.
 
@@ -142,6 +147,7 @@ def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     return jnp.stack([dphi, dtheta, dpsi])
 
 
+@one_program
 def integrate_rate(
     ts: Real[_ArrayLike, " samples"],
     omegas: Real[_ArrayLike, "samples 3"],

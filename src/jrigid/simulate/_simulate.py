@@ -15,6 +15,7 @@ from jaxtyping import Array, PyTree
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
+from jrigid._core.compile import quick_jit
 from jrigid._motion import HasRigidBody, motion_arguments
 from jrigid._stepping.derivatives import (
     moved_by,
@@ -239,7 +240,7 @@ class _Solved(NamedTuple):
     accepted: Array
 
 
-@eqx.filter_jit
+@quick_jit
 def _simulate(inputs: Inputs, options: Options) -> Trajectory:
     """Prepare, integrate, and convert to a trajectory."""
     # Without jumps the vector field as a function of `t0` has the right derivatives.

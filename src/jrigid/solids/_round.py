@@ -2,6 +2,7 @@
 
 from jaxtyping import Array, Bool
 
+from jrigid._core.compile import one_program
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.mass import MassProperties
 from jrigid.solids._common import MeanSquares, solid
@@ -16,6 +17,7 @@ def _in_order(inner: Scalar, outer: Scalar, *_: Scalar) -> Bool[Array, ""]:
     return inner <= outer
 
 
+@one_program
 def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     """Homogeneous ball.
 
@@ -36,6 +38,7 @@ def sphere(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     return solid(lambda r: _round(r * r / 5, r * r / 5), mass, radius=radius)
 
 
+@one_program
 def shell(
     mass: ScalarLike, inner_radius: ScalarLike, outer_radius: ScalarLike
 ) -> MassProperties:
@@ -74,6 +77,7 @@ def shell(
     )
 
 
+@one_program
 def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
     """Homogeneous ellipsoid, axes along x, y, z.
 
@@ -93,6 +97,7 @@ def ellipsoid(mass: ScalarLike, semi_axes: VectorLike) -> MassProperties:
     return solid(lambda axes: axes * axes / 5, mass, shape=(3,), semi_axes=semi_axes)
 
 
+@one_program
 def cylinder(
     mass: ScalarLike, radius: ScalarLike, height: ScalarLike
 ) -> MassProperties:
@@ -118,6 +123,7 @@ def cylinder(
     )
 
 
+@one_program
 def tube(
     mass: ScalarLike,
     inner_radius: ScalarLike,
@@ -156,6 +162,7 @@ def tube(
     )
 
 
+@one_program
 def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
     """Homogeneous circular cone along z, apex up.
 
@@ -184,6 +191,7 @@ def cone(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProper
     )
 
 
+@one_program
 def disk(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     """Infinitely thin homogeneous disk in the plane z = 0.
 
@@ -203,6 +211,7 @@ def disk(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     return solid(lambda r: _round(r * r / 4, 0.0), mass, radius=radius)
 
 
+@one_program
 def hoop(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     """Infinitely thin homogeneous circular hoop in the plane z = 0.
 
@@ -222,6 +231,7 @@ def hoop(mass: ScalarLike, radius: ScalarLike) -> MassProperties:
     return solid(lambda r: _round(r * r / 2, 0.0), mass, radius=radius)
 
 
+@one_program
 def torus(
     mass: ScalarLike, ring_radius: ScalarLike, tube_radius: ScalarLike
 ) -> MassProperties:
@@ -257,6 +267,7 @@ def torus(
     )
 
 
+@one_program
 def capsule(mass: ScalarLike, radius: ScalarLike, height: ScalarLike) -> MassProperties:
     """Homogeneous cylinder along z with a half ball at each end.
 

@@ -4,11 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import all_finite, all_positive, shaped, where_defined
+from jrigid._core.compile import one_program
 from jrigid._types import Real, ScalarLike, VectorLike
 from jrigid.mass import MassProperties, inertia_tensor
 from jrigid.solids._common import MeanSquares, solid
 
 
+@one_program
 def box(mass: ScalarLike, lengths: VectorLike) -> MassProperties:
     """Homogeneous rectangular box, edges along x, y, z.
 
@@ -28,6 +30,7 @@ def box(mass: ScalarLike, lengths: VectorLike) -> MassProperties:
     return solid(lambda edges: edges * edges / 12, mass, shape=(3,), lengths=lengths)
 
 
+@one_program
 def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     """Infinitely thin homogeneous rod along z; its moment about z is zero.
 
@@ -47,6 +50,7 @@ def rod(mass: ScalarLike, length: ScalarLike) -> MassProperties:
     return solid(lambda z: (0.0, 0.0, z * z / 12), mass, length=length)
 
 
+@one_program
 def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
     """Infinitely thin homogeneous rectangle in the plane z = 0.
 
@@ -71,6 +75,7 @@ def lamina(mass: ScalarLike, lengths: Real[ArrayLike, "2"]) -> MassProperties:
     return solid(mean_squares, mass, shape=(2,), lengths=lengths)
 
 
+@one_program
 def tetrahedron(mass: ScalarLike, vertices: Real[ArrayLike, "4 3"]) -> MassProperties:
     """Homogeneous tetrahedron with given corners, in their coordinates.
 

@@ -18,6 +18,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._numerics import cosh_sqrt, root_of_positive, sinhc_sqrt
 from jrigid._types import Real, Scalar, ScalarLike, VectorLike
 from jrigid.top import SymmetricTop, steady_precession
@@ -301,6 +302,7 @@ def _of_top(
     return where_defined(top.is_valid & all_finite(arrays), formula, *arrays)
 
 
+@one_program
 def top_stability(top: SymmetricTop, omega3: ScalarLike) -> TopStability:
     """Stability of a vertical top: sleeping (mgl > 0) or hanging (mgl < 0).
 
@@ -353,6 +355,7 @@ class PrecessionStability(NamedTuple):
     exists: Bool[Array, ""]
 
 
+@one_program
 def precession_stability(
     top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike
 ) -> PrecessionStability:
@@ -416,6 +419,7 @@ class SatelliteStability(NamedTuple):
     region: REGIONS
 
 
+@one_program
 def satellite_stability(
     moments: VectorLike, orbital_rate: ScalarLike = 1.0
 ) -> SatelliteStability:

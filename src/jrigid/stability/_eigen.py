@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Complex, Float, Inexact
 
 from jrigid._checks import all_finite, check_shape, float_arrays, where_defined
+from jrigid._core.compile import one_program
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
 
@@ -16,6 +17,7 @@ _SHARED = 0.999
 _TOGETHER = 8.0
 
 
+@one_program
 def eigenvalues(matrix: Inexact[ArrayLike, "n n"]) -> Complex[Array, " n"]:
     """Eigenvalues of a square matrix, by descending real part.
 

@@ -4,11 +4,11 @@ import math
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Enumeration, settle, whole_number
+from jrigid._core.compile import quick_jit
 from jrigid._core.lanes import in_blocks
 from jrigid._numerics import safe_norm
 from jrigid._types import Scalar, ScalarLike
@@ -107,7 +107,7 @@ def final_spin(
     return settle(_final_spin(motion, steps), throw, findings_of, motion)
 
 
-@eqx.filter_jit
+@quick_jit
 def _final_spin(motion: Motion, steps: int) -> FinalSpin:
     findings = findings_of(motion)
     path = walk(motion, steps, findings.ok)

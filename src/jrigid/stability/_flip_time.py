@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jrigid._checks import INERTIA, all_finite, is_inertia, shaped, where_defined
+from jrigid._core.compile import one_program
 from jrigid._types import InertiaLike, Scalar, VectorLike
 from jrigid.dynamics import angular_momentum, kinetic_energy
 from jrigid.free import polhode_period
 from jrigid.mass import principal_axes
 
 
+@one_program
 def flip_time(inertia: InertiaLike, omega: VectorLike) -> Scalar:
     """Time between two flips of a free body about its intermediate axis.
 

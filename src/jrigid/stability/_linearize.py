@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -18,6 +17,7 @@ from jrigid._checks import (
     settle,
     shaped,
 )
+from jrigid._core.compile import quick_jit
 from jrigid._motion import harmless_motion
 from jrigid._numerics import safe_norm
 from jrigid._stepping.scales import spread
@@ -282,7 +282,7 @@ def _looked_at(frame: _Frame) -> tuple[Findings, _Frame, Array, Scalar]:
     return findings, frame, matrix, rate
 
 
-@eqx.filter_jit
+@quick_jit
 def _linearize(frame: _Frame) -> Linearization:
     findings, frame, matrix, rate = _looked_at(frame)
     ok = findings.ok

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jrigid._checks import (
     settle,
     whole_number,
 )
+from jrigid._core.compile import quick_jit
 from jrigid._core.lanes import in_blocks
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
@@ -217,7 +217,7 @@ class _Indicators(NamedTuple):
     result: RESULTS
 
 
-@eqx.filter_jit
+@quick_jit
 def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators:
     findings = _findings(motion, rows)
     path = walk(motion, schedule.total, findings.ok)

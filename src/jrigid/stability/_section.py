@@ -5,7 +5,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -21,6 +20,7 @@ from jrigid._checks import (
     traced_by_jax,
     whole_number,
 )
+from jrigid._core.compile import quick_jit
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
 from jrigid.stability._maps import place_of_root
@@ -228,7 +228,7 @@ class _Search(NamedTuple):
         return _Position(t, y, ~above, crosses, error), crossing
 
 
-@eqx.filter_jit
+@quick_jit
 def _section(
     motion: Motion,
     condition: Condition,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._checks import Enumeration
+from jrigid._core.compile import one_program
 from jrigid._numerics import root_of_positive, safe_arctan2, safe_norm
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
@@ -115,6 +116,7 @@ def _accurate_low(motion: Invariants, root: Array, low: Array, high: Array) -> A
     return jnp.where(usable, both / jnp.where(usable, high, 1.0), low)
 
 
+@one_program
 def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
     """Least and largest tilt of a motion.
 
@@ -146,6 +148,7 @@ def nutation_bounds(top: SymmetricTop, state: State) -> NutationBounds:
     return _of_invariants(tilts, top, state)
 
 
+@one_program
 def nutation_period(top: SymmetricTop, state: State) -> Scalar:
     """Time from one least tilt to the next.
 
@@ -190,6 +193,7 @@ def _advance(motion: Invariants) -> Advance:
     )
 
 
+@one_program
 def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
     """Angles by which the axis precesses and the body spins in one period of nutation.
 
@@ -214,6 +218,7 @@ def advance_per_nutation(top: SymmetricTop, state: State) -> Advance:
     return _of_invariants(_advance, top, state)
 
 
+@one_program
 def mean_precession(top: SymmetricTop, state: State) -> Scalar:
     """Mean rate at which the axis turns about the vertical, over a period of nutation.
 
@@ -247,6 +252,7 @@ def mean_precession(top: SymmetricTop, state: State) -> Scalar:
     return _of_invariants(rate, top, state)
 
 
+@one_program
 def motion_class(top: SymmetricTop, state: State) -> CLASSES:
     """Kind of a motion, a member of `CLASSES`.
 

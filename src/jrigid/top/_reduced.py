@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jrigid._checks import check_type, float_arrays, shaped
+from jrigid._core.compile import one_program
 from jrigid._numerics import product
 from jrigid._types import Real, Scalar, ScalarLike
 from jrigid.dynamics import State
@@ -35,6 +36,7 @@ class AngleRates(NamedTuple):
     psi: Scalar
 
 
+@one_program
 def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> Scalar:
     """Kinetic less potential energy in z-x-z Euler angles, for `jrigid.lagrangian`.
 
@@ -67,6 +69,7 @@ def lagrangian(q: Real[Any, "3"], q_dot: Real[Any, "3"], top: SymmetricTop) -> S
     return 0.5 * (i1 * across + i3 * spin * spin) - mgl * cos
 
 
+@one_program
 def conserved(top: SymmetricTop, state: State) -> Conserved:
     """Angular momenta about the vertical and the axis, and the energy.
 
@@ -118,6 +121,7 @@ def _angle_rates(
     return AngleRates(phi, p_psi / i3 - phi * jnp.cos(theta))
 
 
+@one_program
 def angle_rates(
     top: SymmetricTop, theta: ScalarLike, p_phi: ScalarLike, p_psi: ScalarLike
 ) -> AngleRates:
@@ -148,6 +152,7 @@ def angle_rates(
     return where_valid(_angle_rates, top, theta=theta, p_phi=p_phi, p_psi=p_psi)
 
 
+@one_program
 def effective_potential(
     top: SymmetricTop,
     theta: Real[ArrayLike, "..."],
@@ -193,6 +198,7 @@ def effective_potential(
     return jnp.vectorize(at_tilt)(theta)
 
 
+@one_program
 def cubic(top: SymmetricTop, conserved: Conserved) -> Float[Array, "4"]:
     """Coefficients of the cubic of the reduced motion: u'^2 = f(u), u = cos theta.
 

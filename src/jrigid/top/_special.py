@@ -16,6 +16,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._numerics import root_of_positive
 from jrigid._types import Scalar, ScalarLike
 from jrigid.dynamics import State
@@ -98,6 +99,7 @@ def _steady(
     return nan_where(~exists, (slow, fast))
 
 
+@one_program
 def steady_precession(
     top: SymmetricTop,
     theta: ScalarLike,
@@ -147,6 +149,7 @@ def steady_precession(
     return SteadyPrecession(slow, fast, ~jnp.isnan(slow))
 
 
+@one_program
 def sleeping_spin(top: SymmetricTop) -> Scalar:
     """Least spin of a stable upright top, 2 sqrt(mgl I1) / I3.
 
@@ -171,6 +174,7 @@ def sleeping_spin(top: SymmetricTop) -> Scalar:
     return where_valid(threshold, top)
 
 
+@one_program
 def gyroscopic(top: SymmetricTop, theta: ScalarLike, omega3: ScalarLike) -> Gyroscopic:
     """Approximate motion of a fast top, as in textbooks.
 
