@@ -1,11 +1,13 @@
 """The door: what is wrong is raised by name, with the value and the lane, or marked."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jrigid as jr
 from jrigid import _checks
 from jrigid._checks import RESULTS, Findings, settle, where_defined
 from jrigid._types import Readable
@@ -48,6 +50,55 @@ XS = jnp.array([1.0, -2.0, -3.0])
 def test_complex_numbers_are_an_error_where_real_ones_are_due():
     with pytest.raises(ValueError, match="must be real numbers, but one is complex"):
         _checks.float_arrays(MOMENTS, np.array(MOMENTS) + 0.1j)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (
+            jr.SymmetricTop(1.0, 0.5, 0.0),
+            r"a SymmetricTop: pass its `\.as_rigid_body\(\)\.inertia`",
+        ),
+        (jr.RigidBody(MOMENTS), r"a RigidBody: pass its `\.inertia`"),
+        (jr.State(jnp.ones(4), MOMENTS), r"one is a State\."),
+        (None, r"one is a NoneType\."),
+    ],
+)
+def test_what_is_no_number_is_named(untyped, value, message):
+    with pytest.raises(ValueError, match=message):
+        jr.free_rotation(value, jr.State(jnp.ones(4), MOMENTS), 1.0)
+    with pytest.raises(ValueError, match=message):
+        jr.dynamics.kinetic_energy(value, MOMENTS)
+
+
+def test_lists_of_traced_numbers_are_arrays(untyped):
+    def turned(angle):
+        return jr.rotation.exp([0.0, angle, 0.0])
+
+    np.testing.assert_allclose(jax.jit(turned)(jnp.pi), [0, 0, 1, 0], atol=1e-15)
+    _, slope = jax.jvp(turned, (0.0,), (1.0,))
+    np.testing.assert_allclose(slope, [0, 0, 0.5, 0], atol=1e-15)
+
+
+def test_a_torque_may_return_a_list():
+    state = jr.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0, 0, 1.0]))
+    body = jr.RigidBody(MOMENTS, lambda t, _state, _args: [0.0, 0.0, t])
+    end = jr.simulate(body, state, 2.0).final_state
+    # The moment is 3, so that the rate grows by t^2 / 6.
+    assert float(end.omega[2]) == pytest.approx(1 + 4 / 6, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (lambda _t, y, _args: y.omega[0], r"must be a `diffrax.Event\(condition\)`"),
+        (diffrax.Event(lambda t, _y: t), r"does not take these"),
+    ],
+)
+def test_a_wrong_event_is_named(untyped, event, message):
+    state = jr.State(jnp.array([1.0, 0, 0, 0]), MOMENTS)
+    with pytest.raises(ValueError, match=message):
+        jr.simulate(jr.RigidBody(MOMENTS), state, 1.0, event=event)
 
 
 @pytest.mark.parametrize(

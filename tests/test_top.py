@@ -539,3 +539,18 @@ def test_wrong_shapes_and_types_are_value_errors(arguments, message, untyped):
 def test_a_top_of_arrays_is_a_value_error(untyped):
     with pytest.raises(ValueError, match="`I1` must have shape"):
         jr.SymmetricTop(np.ones(2), 0.5, 1.0)
+
+
+def test_integrals_of_a_body_without_a_torque_and_of_a_symmetric_top():
+    state = jr.State(jnp.array([0.6, 0.0, 0.8, 0.0]), jnp.array([1.0, 2.0, 3.0]))
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]))
+    found = jr.top.integrals(body, state, "euler")
+    momentum = np.array([1.0, 4.0, 9.0])
+    assert float(found.extra) == pytest.approx(momentum @ momentum, rel=1e-15)
+    assert float(found.energy) == pytest.approx(18, rel=1e-15)
+    assert float(found.vertical_momentum) == 0
+    top = jr.SymmetricTop(1.0, 0.5, 2.0)
+    found = jr.top.integrals(top, state, "lagrange")
+    conserved = jr.top.conserved(top, state)
+    assert float(found.extra) == pytest.approx(1.5, rel=1e-15)
+    assert float(found.energy) == pytest.approx(float(conserved.energy), rel=1e-14)

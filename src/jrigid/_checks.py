@@ -11,6 +11,7 @@ call no other compiles anything (tests/test_no_leak.py).
 """
 
 import functools
+import inspect
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
@@ -147,21 +148,34 @@ def is_good(result: RESULTS) -> bool:
 
 def float_arrays(*values: Any) -> tuple[Array, ...]:
     """Convert to arrays of one floating point dtype, that of all inputs together."""
-    for value in values:
-        if hasattr(value, "inertia"):
-            raise ValueError(
-                "Argument `inertia` must be three moments or a (3, 3) tensor, but it "
-                f"is a {type(value).__name__}: pass its `.inertia`."
-            )
-    # `jnp.result_type` accepts arrays and numbers, but no lists.
-    values = tuple(v if eqx.is_array_like(v) else np.asarray(v) for v in values)
     # Under strict dtype promotion arguments of different dtypes would be an error.
-    # `float` makes floats of integers and leaves float32 as it is.
     with jax.numpy_dtype_promotion("standard"):
+        # `jnp.result_type` accepts arrays and numbers, but no lists.
+        values = tuple(v if eqx.is_array_like(v) else _from_list(v) for v in values)
+        # `float` makes floats of integers and leaves float32 as it is.
         dtype = jnp.result_type(*values, float)
     if jnp.issubdtype(dtype, jnp.complexfloating):
         raise ValueError(f"Arguments must be real numbers, but one is {dtype}.")
     return tuple(jnp.asarray(value, dtype) for value in values)
+
+
+def _from_list(value: Any) -> Array | np.ndarray:
+    """An array of numbers in lists, or ValueError for what is no number."""
+    for name in ("inertia", "as_rigid_body().inertia"):
+        if hasattr(value, name.split("(")[0]):
+            raise ValueError(
+                "Argument `inertia` must be three moments or a (3, 3) tensor, but it "
+                f"is a {type(value).__name__}: pass its `.{name}`."
+            )
+    is_list = isinstance(value, list | tuple)
+    if is_list and any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves(value)):
+        return jnp.asarray(value)
+    array = np.asarray(value)
+    demand(
+        array.dtype != object,
+        f"Arguments must be numbers or arrays, but one is {kind_of(value)}.",
+    )
+    return array
 
 
 def jumps_within(parts: PyTree) -> Float[Array, " jumps"]:
@@ -304,6 +318,19 @@ def check_known(name: str, value: object) -> None:
         f"Argument `{name}` must be known when it is compiled, but it is traced: "
         "hand it past `jit`, `vmap` and `sweep`, in a closure or a Python loop.",
     )
+
+
+def can_be_called(
+    function: Callable[..., Any], *positional: object, **named: object
+) -> bool:
+    """Whether a function takes such arguments, or may take them."""
+    try:
+        inspect.signature(function).bind(*positional, **named)
+    except ValueError:  # The signature of a function written in C is not known.
+        return True
+    except TypeError:
+        return False
+    return True
 
 
 @contextmanager

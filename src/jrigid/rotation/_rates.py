@@ -115,9 +115,9 @@ def euler_rates_to_omega(angles: VectorLike, rates: VectorLike) -> Vector:
 def omega_to_euler_rates(angles: VectorLike, omega: VectorLike) -> Vector:
     """Rates of the z-x-z Euler angles from the angular velocity in body components.
 
-    Where sin theta = 0 exactly, psi' is 0, as psi is in `to_euler`, and phi' carries
-    the turning about the vertical. The part of omega that no rates can express is
-    dropped.
+    Where theta is a multiple of pi to rounding, phi and psi turn about the same axis.
+    Then psi' is 0, and phi' carries the turning about the vertical. The part of omega
+    that no rates can express is dropped.
 
     Args:
         angles: (phi, theta, psi) [rad].

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jrigid._checks import traced_by_jax
+from jrigid._checks import can_be_called, demand, traced_by_jax
 from jrigid._stepping.events import Conditions
 from jrigid._types import BodyState
 
@@ -37,6 +37,11 @@ def condition_of_states(
     takes_all = any(x.kind is x.VAR_KEYWORD for x in parameters)
     names = {x.name for x in parameters}
     passed = {name: x for name, x in options.items() if takes_all or name in names}
+    demand(
+        can_be_called(condition, *range(3), **passed),
+        "The condition of an event must be a callable (t, y, args, **kwargs), but it "
+        f"does not take these: {condition!r}.",
+    )
 
     # What a user's condition returns is checked where it is called.
     def of_array(t: Array, y: Array, args: PyTree) -> Any:

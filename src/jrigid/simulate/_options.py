@@ -9,7 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from jrigid._checks import check_type, is_concrete, whole_number
+from jrigid._checks import (
+    check_type,
+    demand,
+    is_concrete,
+    kind_of,
+    whole_number,
+)
 from jrigid._motion import numbers, solver_of
 from jrigid._stepping.scales import spectral_radius, undamped_rate
 from jrigid._types import BodyState, ScalarLike
@@ -128,7 +134,11 @@ def checked_options(
     if max_steps is None:
         max_steps = _default_max_steps(adjoint)
     if requested.event is not None:
-        check_type("event", requested.event, diffrax.Event)
+        demand(
+            isinstance(requested.event, diffrax.Event),
+            "Argument `event` must be a `diffrax.Event(condition)`, but it is "
+            f"{kind_of(requested.event)}.",
+        )
     check_type("progress", requested.progress, bool, diffrax.AbstractProgressMeter)
     rtol, atol, max_step = _checked_tolerances(requested, dtype)
     if dtype.itemsize == 4:

@@ -109,14 +109,16 @@ def simulate(
         rtol: Relative accuracy, by default 1e-8 (float64) or 1e-5 (float32). At an
             angle of turn phi [rad] the relative error of energy and space angular
             momentum stays below rtol (1 + phi), that of the state of a regular motion
-            below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). To this end the
-            error of a step is at most half of rtol, and less in long runs or for a
-            method of lower order. Where derivatives are taken, steps are shorter and
-            values more accurate, except by implicit solvers. The fastest part of the
-            motion determines phi: for a body in flight that turns slowly, or not at
-            all, it is the angle of the orbit. Errors of position and velocity are
-            relative to their initial magnitudes, or, if these are zero, to those that
-            they reach in the run or in a radian.
+            below 10 rtol (1 + phi), with a floor of 100 eps (1 + phi). A motion that
+            passes close to an unstable equilibrium (near a separatrix) is not regular
+            in this sense: it magnifies the errors of its state. To this end the error
+            of a step is at most half of rtol, and less in long runs or for a method of
+            lower order. Where derivatives are taken, steps are shorter and values more
+            accurate, except by implicit solvers. The fastest part of the motion
+            determines phi: for a body in flight that turns slowly, or not at all, it is
+            the angle of the orbit. Errors of position and velocity are relative to
+            their initial magnitudes, or, if these are zero, to those that they reach in
+            the run or in a radian.
         atol: The same for components near zero, as a fraction of the scale of their
             variable (the initial rate of turning, say); `rtol` by default.
         adjoint: How derivatives are taken. By default reverse mode (`jax.grad`,

@@ -16,7 +16,7 @@ from jrigid._checks import (
     is_unit,
     where_defined,
 )
-from jrigid._motion import plain_state
+from jrigid._motion import HasRigidBody, plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
 from jrigid.dynamics import State, angular_momentum, kinetic_energy
@@ -47,7 +47,9 @@ class Integrals(NamedTuple):
     extra: Scalar | None
 
 
-def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integrals:
+def integrals(
+    body: RigidBody | HasRigidBody, state: State, case: Case | None = None
+) -> Integrals:
     """Energy, vertical angular momentum and the extra integral of a heavy body.
 
     With w = omega1 + i omega2, c = lever1 + i lever2, G = gamma1 + i gamma2 (gamma the
@@ -55,8 +57,8 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
     k c G|^2, and that of Goryachev and Chaplygin omega3 |w|^2 - k gamma3 Re(c* w).
 
     Args:
-        body: A body under `torques.UniformGravity` alone; moments, not a tensor, where
-            a case is requested.
+        body: A `SymmetricTop`, a body under `torques.UniformGravity` alone, or one
+            without a torque; moments, not a tensor, where a case is requested.
         state: Any state of the motion.
         case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3),
             "kovalevskaya" (I1 = I2 = 2 I3, lever across axis 3), "goryachev-chaplygin"
@@ -83,15 +85,21 @@ def integrals(body: RigidBody, state: State, case: Case | None = None) -> Integr
     >>> print(jr.top.integrals(body, state, "kovalevskaya").extra)
     1.0
     """
+    if isinstance(body, HasRigidBody):
+        body = body.as_rigid_body()
     check_type("body", body, RigidBody)
-    check_type("body.torque", body.torque, UniformGravity)
+    gravity = body.torque
+    if body.is_free:
+        zero = jnp.zeros(3, body.inertia.dtype)
+        gravity = UniformGravity(zero[0], zero, zero)
+    check_type("body.torque", gravity, UniformGravity)
     check_option("case", case, (None, *get_args(Case)))
     if case is not None and body.inertia.ndim != 1:
         raise ValueError(
             "Argument `body` must have principal moments where a case is requested, "
             "but it has a tensor."
         )
-    pull, structure = jtu.tree_flatten(body.torque)
+    pull, structure = jtu.tree_flatten(gravity)
     state, (inertia, *pull) = plain_state("state", state, body.inertia, *pull)
     arguments = inertia, structure.unflatten(pull), state
     ok = is_inertia(inertia) & all_finite(arguments) & is_unit(state.attitude)

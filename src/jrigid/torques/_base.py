@@ -5,13 +5,13 @@
 
 import abc
 import dataclasses
-import inspect
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
@@ -21,6 +21,7 @@ from jrigid._checks import (
     all_finite,
     all_positive,
     array_of_shape,
+    can_be_called,
     check_shape,
     demand,
     is_concrete,
@@ -171,7 +172,7 @@ def value_of(
         "without `return`?",
     )
     demand(
-        not np.iscomplexobj(result),
+        not any(map(np.iscomplexobj, jtu.tree_leaves(result))),
         f"Argument `{name}` must return real numbers, but it returns complex ones.",
     )
     value = jnp.asarray(result, state.omega.dtype)
@@ -331,22 +332,11 @@ def as_torque(torque: TorqueFunction | None) -> "AbstractTorque":
     if isinstance(torque, AbstractTorque):
         return torque
     demand(
-        _takes_three(torque),
+        can_be_called(torque, *range(3)),
         "Argument `torque` must be a callable (t, state, args) -> (3,), but it does "
         f"not take these three: {torque!r}.",
     )
     return Torque(torque)
-
-
-def _takes_three(function: Callable[..., Any]) -> bool:
-    """Whether a function can be called with three arguments, or may be."""
-    try:
-        inspect.signature(function).bind(None, None, None)
-    except ValueError:  # The signature of a function written in C is not known.
-        return True
-    except TypeError:
-        return False
-    return True
 
 
 class Sum(AbstractTorque):

@@ -166,6 +166,10 @@ class GravityGradient(AbstractTorque):
 class MagneticDipole(AbstractTorque):
     """Torque of a magnetic field on a dipole fixed in the body: m x B.
 
+    The energy of a motion contains -m . B. For a body in flight in a field that changes
+    from place to place, give `systems.Force` the force grad (m . B) with the potential
+    energy of the other forces alone.
+
     Attributes:
         moment: Dipole moment m, body components [A m^2].
         field: Flux density B, space components [T]: an array, or
@@ -197,10 +201,7 @@ class MagneticDipole(AbstractTorque):
         return jnp.cross(*self._moment_and_field(t, state))
 
     def potential(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:
-        """Potential energy -m . B [J], if B depends on time and position alone.
-
-        A body in flight keeps its energy only under the force grad (m . B) as well.
-        """
+        """Potential energy -m . B [J], if B depends on time and position alone."""
         moment, field = self._moment_and_field(t, state)
         return -jnp.sum(moment * field)
 
