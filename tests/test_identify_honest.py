@@ -796,3 +796,22 @@ def test_a_tensor_that_is_known_has_no_numbers_and_its_state_is_found(rng):
     np.testing.assert_allclose(found.inertia, tensor)
     errors = np.sqrt(np.diagonal(found.covariance))
     assert np.all(np.abs(found.state.omega[0] - moved.omega[0]) < 5 * errors)
+
+
+def test_attitudes_are_also_those_of_a_body_that_turns_the_other_way(rng):
+    """Of a body near a sphere, which turns by 4.2 radians from one to the next."""
+    moments = np.array([1.0, 1.1, 1.3])
+    omega0 = jnp.array([2.7, 2.52, 7.38])
+    ts = np.linspace(0, 20, 40)
+    state = jr.State(jr.rotation.identity(), omega0)
+    attitudes = jr.free_rotation(moments, state, ts).attitude
+    noise = jax.vmap(jr.rotation.exp)(jnp.asarray(0.01 * rng.normal(size=(40, 3))))
+    seen = jax.vmap(jr.rotation.multiply)(attitudes, noise)
+    record = identify.Attitudes(ts, np.asarray(seen), 0.01)
+    found = identify.fit(BLIND, record)
+    assert found.status == Status.UNIDENTIFIABLE, str(found)
+    assert "turns the other way round" in str(found)
+    found = identify.fit(BLIND, record, start=state)
+    assert found.status == Status.OK, str(found)
+    ratios = moments[1:] / moments[0]
+    assert np.all(np.abs(found.ratios - ratios) < 4 * found.ratios_errors), str(found)

@@ -1,6 +1,7 @@
 """fit(): estimates of inertia and other parameters from observations."""
 
 import contextlib
+import dataclasses
 import math
 import sys
 import time
@@ -41,6 +42,7 @@ from jrigid.identify._layout import (
     direct_readings_of,
     longest_turn,
     node_states,
+    other_way_round,
     segments,
     segments_needed,
     whole,
@@ -48,6 +50,7 @@ from jrigid.identify._layout import (
 from jrigid.identify._minimise import tensors_at
 from jrigid.identify._problem import Options, Problem
 from jrigid.identify._quality import Fit
+from jrigid.identify._reasons import reason
 from jrigid.identify._records import (
     Record,
     Samples,
@@ -56,7 +59,7 @@ from jrigid.identify._records import (
     samples_of,
     tells,
 )
-from jrigid.identify._resolution import is_resolved
+from jrigid.identify._resolution import is_resolved, jumps_in_a_segment
 from jrigid.identify._result import FitResult, Status, arrays_of, result_of
 from jrigid.identify._search import (
     Case,
@@ -79,6 +82,7 @@ from jrigid.systems import RigidBody
 _LENGTHS = {True: 3.0, False: 0.75}
 _STEPS = (4, 16, 64)  # of a segment, where one is too long for a torque
 # After so many turns the valley of the minimum is so narrow that probes go slowly, too.
+_MOST_JUMPS = 16  # of a torque in a segment at which steps may end
 _LONG = 60.0  # radians
 _PATIENCE = 2.0  # seconds without a sign of life
 
@@ -131,7 +135,8 @@ def fit(
             result), of one trial or with an axis of trials in front; or a tuple
             (inertia or None, State or None). A state is needed where the attitude
             matters and was not observed; an error below about half a turn is small
-            enough.
+            enough. Attitudes at equal intervals are also those of a body that turns the
+            other way round between them: a state says which.
         unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
             torque, for all body axes or for each (its spectral density is the level
             squared); a `GaussMarkov`, which has a correlation time; or "estimate". A
@@ -146,7 +151,8 @@ def fit(
         absolute_sigma: False: the stated noise is relative, and its level is that of
             the residuals.
         motion: `(system, state, ts, t0) -> State` in place of the exact flow or
-            `simulate`; it must allow forward mode.
+            `simulate`; it must allow forward mode. A search tries bodies whose motion
+            cannot be integrated: give a `simulate` within it `throw=False`.
         doublings: Where the observations give no initial values, the first
             2^-doublings of the record is fitted first, then twice as much, and so on.
         max_steps: Steps of the last stage.
@@ -497,6 +503,7 @@ class _Observed(NamedTuple):
     Attributes:
         samples: Of all records.
         readings: Rates and attitudes along the way, where a sensor tells them.
+        alias: Those of another motion with the same attitudes, if there may be one.
         rate: Rms of the rates [rad/s].
         sizes: Rms of the values of each record.
         angle: Most radians that a trial turns.
@@ -506,6 +513,7 @@ class _Observed(NamedTuple):
 
     samples: Samples
     readings: DirectReadings | None
+    alias: DirectReadings | None
     rate: AnyArray
     sizes: tuple[AnyArray, ...]
     angle: float
@@ -528,6 +536,16 @@ def _observed(
         # residuals.
         samples = samples._replace(whitener=samples.whitener / (GUESS * sizes[0]))
     readings = direct_readings_of(records, samples, attitude0, robust)
+    alias = None
+    if readings is not None and not any(tells(x, "rates") for x in records):
+        alias = other_way_round(readings)
+    if readings is not None and alias is not None and state is not None:
+        # The initial state says which of the two motions it was.
+        first = state.omega
+        off = np.sum((readings.omega[:, 0] - first) ** 2)
+        off_alias = np.sum((alias.omega[:, 0] - first) ** 2)
+        readings = alias if off_alias < off else readings
+        alias = None
     rate = typical_rate(readings, state, samples.ts.dtype)
     angle = 0.0
     coarse = False
@@ -537,7 +555,7 @@ def _observed(
         # alias.
         coarse = longest_turn(readings) > np.pi
     noise = noise_of(records, samples, rate)
-    return _Observed(samples, readings, rate, sizes, angle, coarse, noise)
+    return _Observed(samples, readings, alias, rate, sizes, angle, coarse, noise)
 
 
 class _Opening(NamedTuple):
@@ -613,25 +631,25 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     observed = _observed(records, state, attitude0, options.robust)
     input_result = _judged(task, records, observed, throw)
     given = _unknowns(task, records, observed)
+    usable = is_good(input_result)
     # The first division whose steps follow the torque is taken, since finer ones cost
     # more time. If none does, the last one is, and `integration_error` of the result
     # says how well it does.
     for division, length in _divisions(options, observed):
         options = division
         opening = _opening(given, observed, tensor, state, options, length)
-        # A probe holds a direction; here none is held, by a line of the same structure.
-        line = Line(np.zeros_like(opening.point.numbers), np.zeros((), dtype))
-        unknowns = opening.unknowns.holding(line)
-        problem = Problem(options, unknowns, observed.samples, observed.noise)
+        problem = _problem(options, observed, opening)
         # Of a record that cannot be used nothing is calculated.
-        usable = is_good(input_result)
-        if not usable or is_resolved(problem, opening.cut, opening.point):
+        if not usable:
+            break
+        problem, follows = _along_the_torque(problem, opening)
+        if follows:
             break
     tensor = opening.tensor
     if options.dense:
         # A level is sought, in proportion to the tensor.
         numbers = np.stack([opening.starts[0]] * 2)
-        tensor = np.asarray(tensors_at(unknowns, numbers))[0]
+        tensor = np.asarray(tensors_at(problem.unknowns, numbers))[0]
     case = Case(
         problem=problem,
         single=opening.single,
@@ -642,9 +660,47 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         torque=task.torque,
         coarse=observed.coarse,
         long=observed.angle > _LONG,
+        alias=None,
         effort=effort,
     )
+    if usable and observed.alias is not None:
+        other = observed._replace(readings=observed.alias)
+        opening = _opening(given, other, opening.tensor, state, options, length)
+        problem = _problem(problem.options, other, opening)
+        case = dataclasses.replace(case, alias=_read_anew(case, problem, opening))
     return case, input_result
+
+
+def _problem(options: Options, observed: _Observed, opening: _Opening) -> Problem:
+    """A record as it is fitted, with numbers as they are at the opening."""
+    # A probe holds a direction; here none is held, by a line of the same structure.
+    numbers = opening.point.numbers
+    line = Line(np.zeros_like(numbers), np.zeros((), numbers.dtype))
+    unknowns = opening.unknowns.holding(line)
+    return Problem(options, unknowns, observed.samples, observed.noise)
+
+
+def _read_anew(case: Case, problem: Problem, opening: _Opening) -> Case:
+    """The case of a record, from another reading of it."""
+    return dataclasses.replace(
+        case,
+        problem=problem,
+        cut=opening.cut,
+        point=opening.point,
+        starts=opening.starts,
+    )
+
+
+def _along_the_torque(problem: Problem, opening: _Opening) -> tuple[Problem, bool]:
+    """The problem, with steps that end at jumps if need be; do they follow the torque?"""
+    if is_resolved(problem, opening.cut, opening.point):
+        return problem, True
+    jumps = jumps_in_a_segment(problem, opening.cut, opening.point)
+    if not 0 < jumps <= _MOST_JUMPS:
+        return problem, False
+    options = problem.options._replace(jumps=jumps)
+    problem = dataclasses.replace(problem, options=options)
+    return problem, is_resolved(problem, opening.cut, opening.point)
 
 
 def _divisions(
@@ -732,7 +788,7 @@ def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str,
             fields["conventions"] = _conventions(task, best, effort)
         for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
             if throw and int(fields["status"]) == int(status):
-                text = conventions.in_words(fields["conventions"])
+                text = reason(result_of(fields))
                 raise RuntimeError(f"{Status[status]} {text}".strip())
         results.append(fields)
     return results

@@ -6,6 +6,8 @@ repeated moments too. Here moments nearer to each other than a ten-millionth (in
 a thousandth) are taken to be that far apart in the derivative. The value is exact.
 """
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ from jrigid._motion import depends_on
 from jrigid._numerics import product
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid._stepping.method import Method, method_of
-from jrigid._stepping.step import equal_steps
+from jrigid._stepping.step import Field, equal_steps
 from jrigid.dynamics import State
 from jrigid.free import relative_rotation
 from jrigid.rotation import attitude_rate, normalize
@@ -143,12 +145,13 @@ def forced_flow(
     depends_on_attitude: bool,
     method: Method = ONE_STEP,
     steps: int | Array = 1,
+    jumps: int = 0,
 ) -> State:
     """State at t1, before or after t0, by equal steps without an error estimate.
 
     The default is one step, which suffices for a part of a turn where the torque
-    changes no faster than the body turns. If nothing depends on
-    the attitude, the attitude stays as it is.
+    changes no faster than the body turns. If nothing depends on the attitude, the
+    attitude stays as it is.
 
     Args:
         system: The body.
@@ -157,7 +160,9 @@ def forced_flow(
         t1: Time of the result [s].
         depends_on_attitude: Whether the attitude is integrated.
         method: Runge-Kutta method.
-        steps: How many steps are made.
+        steps: How many steps are made, from each jump to the next.
+        jumps: At how many of the times steps end that the system declares as jumps: the
+            first ones after t0.
 
     Gradients: in every mode, of every order; forward alone where `steps` is an array.
     """
@@ -173,10 +178,45 @@ def forced_flow(
     if depends_on_attitude:
         start = jnp.concatenate([state.attitude, state.omega])
     pieces = steps if isinstance(steps, int) else steps.astype(t0.dtype)
-    end = equal_steps(method, rates, t0, (t1 - t0) / pieces, start, steps)
+
+    def smooth_part(field: Field, y: Array, start: Array, end: Array) -> Array:
+        return equal_steps(method, field, start, (end - start) / pieces, y, steps)
+
+    def to_jump(place: tuple[Array, Array], jump: Array) -> tuple[Any, None]:
+        y, t = place
+        return (smooth_part(_between(rates, t, jump), y, t, jump), jump), None
+
+    if jumps:
+        stops = _stops(system.jumps.astype(t0.dtype), t0, t1, jumps)
+        (end, _), _ = jax.lax.scan(to_jump, (start, t0), stops)
+    else:
+        end = smooth_part(rates, start, t0, t1)
     # Runge-Kutta steps do not keep the norm of a quaternion.
     attitude = normalize(end[:4]) if depends_on_attitude else state.attitude
     return State(attitude, end[-3:])
+
+
+def _stops(jumps: Array, t0: Array, t1: Array, count: int) -> Array:
+    """The first jumps on the way from t0 to t1, then t1 (count + 1,)."""
+    way = jnp.where(t1 < t0, t0 - jumps, jumps - t0)
+    passed = (way >= 0) & (way <= jnp.abs(t1 - t0))
+    nearest = jnp.argsort(jnp.where(passed, way, jnp.inf))[:count]
+    # Where there are fewer, the steps to the last ones have no length.
+    stops = jnp.where(passed, jumps, t1)[nearest]
+    return jnp.concatenate([stops, t1[None]])
+
+
+def _between(field: Field, start: Array, end: Array) -> Field:
+    """The vector field between two jumps, on their inner sides at the jumps."""
+    beside = 4 * jnp.finfo(start.dtype).eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    first = jnp.minimum(start, end) + beside
+    last = jnp.maximum(start, end) - beside
+
+    def inside(t: Array, y: Array) -> Array:
+        # The shift is rounding, and derivatives in time are those of t.
+        return field(t + jax.lax.stop_gradient(jnp.clip(t, first, last) - t), y)
+
+    return inside
 
 
 def needs_attitude(system: RigidBody) -> bool:

@@ -30,7 +30,7 @@ from jrigid.identify._layout import DirectReadings
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor
 from jrigid.systems import RigidBody
-from jrigid.torques import Rotor, Sampled, SpinningMass, Sum
+from jrigid.torques import GravityGradient, Rotor, Sampled, SpinningMass, Sum
 
 GUESS = 0.02  # of the size of values, for a noise that is not known
 
@@ -122,20 +122,27 @@ def refuse(
     has_rotor = any(isinstance(x, Rotor | SpinningMass) for x in terms)
     demand(
         scale != "trace" or not has_rotor or inertia_model.absolute,
-        "Argument `scale` must be 'rotor' for a system with a `torques.Rotor`, whose "
-        "momentum sets the scale of the tensor, but it is 'trace', which would keep "
-        "the trace of `system`.",
+        "Argument `scale` must be 'rotor' for a system with a `Rotor` or a "
+        "`SpinningMass`, whose momentum sets the scale of the tensor, but it is "
+        "'trace', which would keep the trace of `system`.",
     )
     demand(
         scale != "rotor" or has_rotor,
-        "Argument `scale` must not be 'rotor' for a system without a `torques.Rotor`, "
-        "but it is: nothing sets the scale of the tensor.",
+        "Argument `scale` must not be 'rotor' for a system without a `Rotor` or a "
+        "`SpinningMass`, but it is: nothing sets the scale of the tensor.",
     )
     momenta = any(isinstance(x.sensor, MomentumSensor) for x in records)
     demand(
         scale != "known" or not system.is_free or momenta or inertia_model.absolute,
         "Argument `scale` must be 'trace' for a body without torque, but it is "
         "'known': free motion tells ratios of the moments, never their scale.",
+    )
+    in_proportion = all(isinstance(x, GravityGradient) for x in terms)
+    demand(
+        scale != "known" or not (terms and in_proportion) or momenta,
+        "Argument `scale` must be 'trace' where `GravityGradient` is the only torque, "
+        "but it is 'known': in proportion to the inertia, it tells ratios of the "
+        "moments, never their scale.",
     )
 
 

@@ -17,6 +17,10 @@ MOST_NODES = 2000  # of a trial, where each sample has one
 # An attitude so many times as far from the path of its neighbours as others are from
 # that of theirs is no place to begin a segment.
 _LONE = 8.0
+# Intervals that differ by more than this part are no equal ones.
+_UNEVEN = 0.1
+# Radians from one attitude to the next, twelve samples a turn.
+_SMALL_TURN = 0.5
 
 
 class Layout(NamedTuple):
@@ -280,6 +284,24 @@ def angle_turned(readings: DirectReadings) -> np.ndarray:
 def longest_turn(readings: DirectReadings) -> float:
     """Largest angle turned from one sample to the next [rad]."""
     return float(np.max(np.diff(angle_turned(readings), axis=1), initial=0.0))
+
+
+def other_way_round(readings: DirectReadings) -> DirectReadings | None:
+    """Readings of a motion that turns the other way from each attitude to the next.
+
+    Attitudes at equal intervals are those of such a motion too, an alias. None where
+    intervals differ, or where turns are so small that nobody would think of it.
+    """
+    steps = [np.diff(t[x]) for t, x in zip(readings.ts, readings.valid, strict=True)]
+    steps = np.concatenate(steps)
+    step = np.median(steps) if steps.size else 0.0
+    if not step > 0 or np.max(np.abs(steps - step)) > _UNEVEN * step:
+        return None
+    speed = np.linalg.norm(readings.omega, axis=-1, keepdims=True)
+    if step * np.median(speed[readings.valid]) < _SMALL_TURN:
+        return None
+    factor = 1 - 2 * np.pi / (step * np.where(speed > 0, speed, np.inf))
+    return readings._replace(omega=(factor * readings.omega).astype(speed.dtype))
 
 
 def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:

@@ -40,6 +40,7 @@ class Options(NamedTuple):
         shooting: Whether each segment has a state of its own, not only each trial.
         nodes: How many nodes a trial has.
         steps: Runge-Kutta steps from a node to a sample, or to the next node.
+        jumps: How many jumps of the torque may lie between; steps end there.
         unmodelled: Whether there is a torque without a model: "none", "known" or
             "estimate".
         robust: Whether Cauchy's loss may be used.
@@ -53,6 +54,7 @@ class Options(NamedTuple):
     shooting: bool = False
     nodes: int = 1
     steps: int = 1
+    jumps: int = 0
     unmodelled: str = "none"
     robust: bool = False
     noise_known: bool = True
@@ -146,9 +148,15 @@ def _flow(
     if not options.free_motion:
 
         def flow(state: State, start: Array, end: Array) -> State:
-            on_attitude = options.depends_on_attitude
-            steps = options.steps
-            return forced_flow(system, state, start, end, on_attitude, steps=steps)
+            return forced_flow(
+                system,
+                state,
+                start,
+                end,
+                options.depends_on_attitude,
+                steps=options.steps,
+                jumps=options.jumps,
+            )
 
         return jax.vmap(flow)(before, start, end)
     turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(

@@ -16,7 +16,7 @@ from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments,
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
-from jrigid.identify._sensors import Gyro
+from jrigid.identify._sensors import AttitudeSensor, Gyro
 
 # I3/I1: degrees for radians shrink the gaps of the moments by a factor of 57.
 _NEARLY_A_SPHERE = 1.03
@@ -80,12 +80,24 @@ def _reason(result: FitResult) -> str:
         )
     if result.status == Status.OK:
         return _of_parameters(result)
+    if result.status == Status.UNIDENTIFIABLE and _may_turn_the_other_way(result):
+        return (
+            "Attitudes at equal intervals are also those of a body that turns the "
+            "other way round between them. Pass `start` with a state: it says which."
+        )
     if not np.all(np.isfinite(np.asarray([result.level, result.level_errors]))):
         return (
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
     return _of_gyro(result) or _of_noise(result)
+
+
+def _may_turn_the_other_way(result: FitResult) -> bool:
+    """Whether attitudes alone were observed, and other bodies describe them as well."""
+    sensors = result.fitted()[1:]
+    alone = all(isinstance(x, AttitudeSensor) for x in sensors)
+    return alone and bool(result.diagnostics.ambiguous)
 
 
 def _of_gyro(result: FitResult) -> str:

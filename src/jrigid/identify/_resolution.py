@@ -22,6 +22,7 @@ from jrigid.identify._host import conjugate, log, multiply
 from jrigid.identify._layout import Layout
 from jrigid.identify._problem import Problem, over_trials
 from jrigid.identify._smoother import Point
+from jrigid.identify._unknowns import Unknowns
 
 # Steps of a segment that are compared with: the most, the fewest, and of all segments
 # together, which take a second or two.
@@ -49,8 +50,15 @@ def _states_after(
         system = problem.unknowns.parts(point.numbers, point.own, leaves)[0]
 
         def flow(state: State, start: Array, end: Array) -> State:
-            on_attitude = problem.options.depends_on_attitude
-            return forced_flow(system, state, start, end, on_attitude, steps=steps)
+            return forced_flow(
+                system,
+                state,
+                start,
+                end,
+                problem.options.depends_on_attitude,
+                steps=steps,
+                jumps=problem.options.jumps,
+            )
 
         layout = trial.layout
         nodes = State(point.attitude, point.omega)
@@ -71,6 +79,28 @@ def _to_last_samples(layout: Layout, seen: np.ndarray) -> Layout:
 def is_resolved(problem: Problem, layout: Layout, point: Point) -> bool:
     """Whether the steps of a fit follow the motion from the states at the nodes."""
     return integration_error(problem, layout, point) <= 1
+
+
+@small_program
+def _jumps(
+    unknowns: Unknowns, numbers: Array, own: Array, leaves: tuple[AnyArray, ...]
+) -> Array:
+    """Times of a trial at which the torque declares that it is not smooth."""
+    return unknowns.parts(numbers, own, leaves)[0].jumps
+
+
+def jumps_in_a_segment(problem: Problem, layout: Layout, point: Point) -> int:
+    """The most jumps that the torque declares within a segment, or at its ends."""
+    layout = _to_last_samples(layout, problem.samples.seen)
+    unknowns = problem.unknowns
+    most = 0
+    for trial, own in enumerate(point.own):
+        leaves = unknowns.leaves_of(trial)
+        jumps = np.sort(_jumps(unknowns, point.numbers, own, leaves))
+        first = np.searchsorted(jumps, layout.start[trial], side="left")
+        last = np.searchsorted(jumps, layout.end[trial], side="right")
+        most = max(most, int(np.max(last - first)))
+    return most
 
 
 def integration_error(problem: Problem, layout: Layout, point: Point) -> float:

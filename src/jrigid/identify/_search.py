@@ -185,6 +185,7 @@ class Case:
         torque: Unmodelled, if it is known.
         coarse: Whether the body turns by more than half a turn between samples.
         long: Whether it turns many times, so that probes must go slowly too.
+        alias: The same record as that of another motion, if there may be one.
         effort: How hard to try.
     """
 
@@ -197,6 +198,7 @@ class Case:
     torque: GaussMarkov
     coarse: bool
     long: bool
+    alias: "Case | None"
     effort: Effort
 
     @property
@@ -468,12 +470,34 @@ def search(case: Case) -> Search:
             wrong = other_wrong
             weak = other_weak
         index += 1
+    if case.alias is not None and (wrong > 0 or not ambiguous):
+        best, rival = yield from _beside_alias(case.alias, best)
+        ambiguous = ambiguous or rival
+        wrong = misfit(best)
+        weak = weakest(best)
     best = dataclasses.replace(best, ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
         # Squares beside levels of their own differ, so fits with a level are not
         # probed.
         best = yield from _probed(case, best, weak)
     return best
+
+
+def _beside_alias(
+    alias: Case, best: Fit
+) -> Generator[Request, Minimum, tuple[Fit, bool]]:
+    """The better of a fit and one of its alias, and whether they are about as good."""
+    # The rates of an alias are rough, and with them its first start. The last one is
+    # rounder.
+    numbers = alias.starts[len(alias.starts) - 1]
+    other = yield from attempt(alias, alias.problem, numbers, slow=True)
+    at = weakest(best)
+    fall = (at.square - weakest(other).square) / at.noise
+    wrong = misfit(best)
+    other_wrong = misfit(other)
+    as_good = other_wrong <= wrong
+    better = other_wrong < wrong or (as_good and fall > _RIVAL)
+    return other if better else best, as_good and abs(fall) < _RIVAL
 
 
 def no_search(case: Case) -> Search:
