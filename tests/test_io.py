@@ -800,6 +800,22 @@ def test_what_mujoco_refuses_is_refused(text, match):
             "<mujoco><worldbody><attach model='b'/></worldbody></mujoco>",
             "`<attach>` adds bodies",
         ),
+        (
+            "<mujoco><worldbody><body name='a'><frame pos='1 0 0'><inertial pos='0 1 0'"
+            " mass='1' diaginertia='1 1 1'/></frame></body></worldbody></mujoco>",
+            "an `<inertial>` is in a `<frame>`, which moves it",
+        ),
+        (
+            mjcf("<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>" * 2),
+            "must have one `<inertial>` at most",
+        ),
+        (
+            mjcf(
+                "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1' euler='1 2 3'/>",
+                "angle='deg'",
+            ),
+            "`angle` must be one of 'degree', 'radian'",
+        ),
         *(
             (
                 mjcf(

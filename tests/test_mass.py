@@ -1561,3 +1561,13 @@ def test_wrong_shape_is_an_error(name, untyped):
     function, arguments, message = WRONG_SHAPES[name]
     with pytest.raises(ValueError, match=message):
         function(*arguments)
+
+
+def test_lists_place_and_turn_a_body(untyped):
+    box = jr.solids.box(2.0, np.array([0.1, 0.2, 0.3]))
+    moved = box.translated([0.1, 0, 0])
+    np.testing.assert_allclose(moved.center_of_mass, [0.1, 0, 0])
+    expected = moved.about(np.zeros(3))
+    np.testing.assert_array_equal(moved.about([0, 0, 0]), expected)
+    turned = box.rotated([1.0, 0, 0, 0])
+    np.testing.assert_allclose(turned.inertia, box.inertia, rtol=1e-15)

@@ -1350,3 +1350,26 @@ def test_no_rest(rng):
         times, np.tile([0.0, 0.0, 3.0], (2000, 1))
     )  # on a turntable
     assert jr.records.rests(steady) == []
+
+
+def test_a_rest_ends_before_a_hand_takes_the_body_up(rng):
+    rate = 400
+    spin = np.array([6.0, 8.0, 3.0])
+    x = np.linspace(0, 1, 160)[:, None]
+    taken_up = spin * x**2 * (3 - 2 * x)
+    rest, held = np.zeros((600, 3)), np.repeat([spin], 360, axis=0)
+    parts = [rest, taken_up, held, taken_up[::-1]] * 8
+    bias = np.array([0.02, -0.01, 0.03])
+    rates = np.concatenate([*parts, rest]) + bias
+    rates = rates + 0.02 * rng.normal(size=rates.shape)
+    reading = jr.records.Reading(np.arange(len(rates)) / rate, rates)
+    parts = jr.records.rests(reading)
+    assert len(parts) == 9
+    for part in parts:
+        for end in (part.rates[:100], part.rates[-100:]):
+            assert np.linalg.norm(end.mean(axis=0) - bias) < 0.02
+    count = sum(x.times.size for x in parts)
+    assert count > 0.6 * 9 * 600
+    noise = jr.records.noise(reading)
+    np.testing.assert_allclose(noise.density * rate**0.5, 0.02, rtol=0.1)
+    assert np.all(np.abs(noise.bias - bias) < 4 * 0.02 / count**0.5)

@@ -53,6 +53,11 @@ _MADE = (
         f"`<replicate>` makes bodies: {_SAVED} and read that.",
     ),
     ("mujoco", ".//attach", f"`<attach>` adds bodies: {_SAVED} and read that."),
+    (
+        "mujoco",
+        ".//frame/inertial",
+        f"an `<inertial>` is in a `<frame>`, which moves it: {_SAVED} and read that.",
+    ),
 )
 # Options of MJCF's compiler that change masses.
 _MASS_OPTIONS = ("settotalmass", "boundmass", "boundinertia")
@@ -204,7 +209,9 @@ def _turn(stated: _Stated) -> "Rotation":
     """The rotation from the axes of the tensor to those of the link."""
     attributes, options = stated
     rotations = extra("io", "scipy.spatial.transform").Rotation
-    unit = np.pi / 180 if options.get("angle", "degree") == "degree" else 1.0
+    angle = options.get("angle", "degree")
+    check_option("angle", angle, ("degree", "radian"))
+    unit = np.pi / 180 if angle == "degree" else 1.0
     if text := attributes.get("quat"):
         return rotations.from_quat(np.roll(_numbers(text, 4), -1))
     if text := attributes.get("axisangle"):
@@ -271,6 +278,16 @@ def _links(root: ET.Element) -> dict[str, ET.Element]:
     return links
 
 
+def _refuse_made_links(argument: str, root: ET.Element) -> None:
+    """Raise ValueError for a file whose links, or their inertials, a program makes."""
+    for tag, place, message in _MADE:
+        is_made = root.tag == tag and root.find(place) is not None
+        demand(
+            not is_made,
+            f"Argument `{argument}` must hold all links itself, but {message}",
+        )
+
+
 def read_inertials(
     path: str | Path, *, unphysical: _Unphysical = "raise", thickness: float = 0.0
 ) -> dict[str, MassProperties]:
@@ -316,17 +333,19 @@ def read_inertials(
     check_option("unphysical", unphysical, get_args(_Unphysical))
     source = document(path)
     root = tree_of(source)
-    for tag, place, message in _MADE:
-        is_made = root.tag == tag and root.find(place) is not None
-        demand(
-            not is_made, f"Argument `path` must hold all links itself, but {message}"
-        )
+    _refuse_made_links("path", root)
     bodies = {}
     wrong = []
     for name, link in _links(root).items():
-        inertial = link.find("inertial")
-        if inertial is None:
+        inertials = link.findall("inertial")
+        demand(
+            len(inertials) < 2,
+            f"A link must have one `<inertial>` at most, but {name!r} has "
+            f"{len(inertials)}.",
+        )
+        if not inertials:
             continue
+        (inertial,) = inertials
         try:
             mass, center, tensor = _read(inertial, root)
         except ValueError as error:
@@ -422,6 +441,7 @@ def write_inertials(
         template = file.format("".join(link.format(quoteattr(name)) for name in bodies))
     source = document(template)
     root = tree_of(source)
+    _refuse_made_links("template", root)
     links = _links(root)
     strange = sorted(set(bodies) - set(links))
     message = f"but {strange} are not in it."

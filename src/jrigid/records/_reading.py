@@ -17,6 +17,9 @@ _STILL = (0.1, 0.2)
 # The quietest tenth of the windows are at rest; others at rest are up to three times
 # as noisy.
 _FLOOR = (0.1, 3.0)
+# Standard errors by which the mean of a window at an end of a rest differs from that of
+# its neighbour where the body begins to turn.
+_TURNS = 6.0
 # Averaging times in a factor of two.
 _PER_OCTAVE = 4
 # Allan deviation of 1/f noise of a unit instability: sqrt(2 log 2 / pi).
@@ -241,7 +244,12 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
     most_spread, most_mean = _STILL
     floor = factor * np.quantile(spreads, quantile)
     is_quiet = spreads <= min(most_spread, floor)
-    is_quiet &= np.linalg.norm(rates[windows].mean(axis=1), axis=1) < most_mean
+    means = rates[windows].mean(axis=1)
+    is_quiet &= np.linalg.norm(means, axis=1) < most_mean
+    if not np.any(is_quiet):
+        return []
+    error = np.median(spreads[is_quiet]) / np.sqrt(size)
+    is_quiet &= ~_begins_to_turn(means, is_quiet, error)
     is_still = np.isin(np.arange(times.size), windows[is_quiet])
     # Of n readings the times span n - 1 intervals.
     shortest = min_duration - reading.interval
@@ -250,6 +258,31 @@ def rests(reading: Reading, *, min_duration: float = 1.0) -> list[Reading]:
         # Windows on both sides of a break make one run.
         parts += reading[first:last].pieces()
     return [part for part in parts if np.ptp(part.times) >= shortest]
+
+
+def _begins_to_turn(means: np.ndarray, quiet: np.ndarray, error: float) -> np.ndarray:
+    """Quiet windows at the ends of rests whose mean is not that of their neighbours.
+
+    Slow drifts of a bias are none: from one window to the next they are small.
+
+    Args:
+        means: Of the rates in each window (windows, 3).
+        quiet: Which windows are quiet.
+        error: Standard error of a mean.
+    """
+    found = np.zeros_like(quiet)
+    for first, last in runs(quiet):
+        inner = means[first:last]
+        # A hand takes up a body within half a second, two windows.
+        for _ in range(min(2, (last - first - 1) // 2)):
+            off = np.linalg.norm(inner[[0, -1]] - inner[[1, -2]], axis=1)
+            off_begins, off_ends = off > _TURNS * error
+            found[first] |= off_begins
+            found[last - 1] |= off_ends
+            first += off_begins
+            last -= off_ends
+            inner = means[first:last]
+    return found
 
 
 def _density(curve: Allan, lowest: np.ndarray) -> np.ndarray:
