@@ -88,11 +88,18 @@ def test_a_torque_may_return_a_list():
     assert float(end.omega[2]) == pytest.approx(1 + 4 / 6, rel=1e-7)
 
 
+def test_a_jump_is_not_nan():
+    state = jr.State(jnp.array([1.0, 0, 0, 0]), MOMENTS)
+    with pytest.raises(RuntimeError, match="`jumps` must hold times"):
+        jr.simulate(jr.RigidBody(MOMENTS), state, 1.0, jumps=jnp.array([jnp.nan]))
+
+
 @pytest.mark.parametrize(
     ("event", "message"),
     [
         (lambda _t, y, _args: y.omega[0], r"must be a `diffrax.Event\(condition\)`"),
         (diffrax.Event(lambda t, _y: t), r"does not take these"),
+        (diffrax.Event(lambda _t, y, _args: y.omega), r"`event` must return a number"),
     ],
 )
 def test_a_wrong_event_is_named(untyped, event, message):

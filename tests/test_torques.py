@@ -1159,3 +1159,44 @@ def test_wrong_argument_is_an_error(name, untyped):
     call, message = WRONG[name]
     with pytest.raises(ValueError, match="Argument " + message):
         call()
+
+
+def test_gravity_gradient_acts_on_a_wheel_too():
+    """With a wheel that stands still the body is the rigid one of all its mass."""
+    moments = np.array([1.0, 1.3, 1.5])
+    wheel = tq.SpinningMass(0.1, np.array([0.0, 0.0, 2.0]))
+    gradient = tq.GravityGradient(1.0, tq.KeplerOrbit(1.0, 1.0, 0.0))
+    own = np.array([1.0, 1.3, 1.4])
+    body = jr.RigidBody(own, gradient + wheel)
+    turned = jr.rotation.exp(np.array([0.3, 0.5, 0.2]))
+    state = jr.State(turned, jnp.zeros(3), (jnp.array(0.0),))
+    n = np.asarray(jr.rotation.rotate_inverse(turned, np.array([1.0, 0.0, 0.0])))
+    expected = 3 * np.cross(n, moments * n)
+    np.testing.assert_allclose(body.torque_on(0.0, state, None), expected, rtol=1e-14)
+    tensor = jr.RigidBody(np.diag(own), wheel + gradient)
+    np.testing.assert_allclose(tensor.torque_on(0.0, state, None), expected, rtol=1e-14)
+    # A satellite in its orbit has the frequencies of the rigid body.
+    flying = jr.State(
+        jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 1.0]), (jnp.array(1.0),)
+    )
+    found = jr.stability.linearize(body, flying).eigenvalues.imag
+    squared = jr.stability.satellite_stability(moments).roll_yaw_squared
+    for frequency in np.sqrt(-np.asarray(squared).real):
+        assert np.min(np.abs(found - frequency)) < 1e-7
+
+
+def test_a_rotor_refuses_a_step_of_its_momentum():
+    ts = np.array([0.0, 1.0, 1.0, 2.0])
+    momenta = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0.5], [0, 0, 0.5]])
+    with pytest.raises(ValueError, match="must be continuous"):
+        tq.Rotor(tq.Sampled(ts, momenta))
+    # A time that is there twice with one value is no step.
+    rotor = tq.Rotor(tq.Sampled(ts, momenta[[0, 1, 1, 3]]))
+    assert not rotor.momentum.has_known_step
+
+
+def test_a_list_of_parts_is_a_tuple():
+    state = jr.State(np.array([1.0, 0, 0, 0]), np.zeros(3), [np.array(3.0)])
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), tq.SpinningMass(0.1, np.ones(3)))
+    assert isinstance(state.internal, tuple)
+    assert jr.simulate(body, state, 0.1).final_state.internal[0].shape == ()

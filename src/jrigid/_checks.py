@@ -197,10 +197,12 @@ def state_array(value: Any) -> Any:
 
 
 def internal_parts(internal: PyTree) -> PyTree:
-    """The internal state, with None in place of `()`.
+    """The internal state, a list as a tuple, and None in place of an empty one.
 
     diffrax cannot save `()`, since equinox takes it for a leaf.
     """
+    if isinstance(internal, list):
+        internal = tuple(internal)
     return None if isinstance(internal, tuple) and not internal else internal
 
 

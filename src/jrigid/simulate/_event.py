@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jrigid._checks import can_be_called, demand, traced_by_jax
+from jrigid._checks import can_be_called, demand, kind_of, traced_by_jax
 from jrigid._stepping.events import Conditions
 from jrigid._types import BodyState
 
@@ -46,7 +46,13 @@ def condition_of_states(
     # What a user's condition returns is checked where it is called.
     def of_array(t: Array, y: Array, args: PyTree) -> Any:
         with traced_by_jax("the condition of an event"):
-            return condition(t0 + t, to_state(y), args, **passed)
+            value = condition(t0 + t, to_state(y), args, **passed)
+        demand(
+            not isinstance(value, jax.Array) or value.ndim == 0,
+            "The condition of an `event` must return a number or a boolean, but it "
+            f"returns {kind_of(value)}.",
+        )
+        return value
 
     return of_array
 

@@ -169,6 +169,10 @@ def _check_times(findings: Findings, inputs: Inputs, since_start: Array) -> None
     wrong = ~jnp.isfinite(since_start) | ~(flat >= before)
     value = flat[jnp.argmax(wrong)]
     findings.require(~jnp.any(wrong), RESULTS.invalid_times, value=value)
+    # Infinite jumps are padding.
+    known = ~jnp.any(jnp.isnan(inputs.jumps))
+    message = "Argument `jumps` must hold times, but one is NaN."
+    findings.require(known, RESULTS.invalid_times, message)
 
 
 def require_enough_steps(findings: Findings, ok: AnyBool, limits: Limits) -> None:

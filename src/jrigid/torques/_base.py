@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
     all_finite,
@@ -31,6 +32,7 @@ from jrigid._numerics import safe_norm
 from jrigid._types import (
     BodyState,
     InertiaLike,
+    Matrix,
     Readable,
     Scalar,
     ScalarLike,
@@ -261,6 +263,15 @@ class AbstractTorque(Readable):
         """Potential energy [J]; zero if the torque has none."""
         return zero_like(state)
 
+    @property
+    def inertia_of_parts(self) -> Matrix | None:
+        """Inertia that parts have beside that of the body [kg m^2]; None for nothing.
+
+        `GravityGradient` acts on both. For a wheel with a spin of its own this is its
+        moment about its axis.
+        """
+        return None
+
     def internal_at_rest(self, state: BodyState) -> tuple[PyTree, ...]:
         """Internal state of parts that move with the body; `()` if there are none."""
         return ()
@@ -392,7 +403,13 @@ class Sum(AbstractTorque):
         )
 
     def of_body(self, inertia: InertiaLike) -> "Sum":
-        """The torques on a body of this inertia."""
+        """The torques on a body of this inertia, and on its parts."""
+        parts = [x.inertia_of_parts for x in self.terms]
+        parts = [x for x in parts if x is not None]
+        if parts:
+            own = array_of_shape("inertia", inertia, *INERTIA)
+            tensor = jnp.diag(own) if own.ndim == 1 else own
+            inertia = sum((x.astype(tensor.dtype) for x in parts), tensor)
         return Sum(term.of_body(inertia) for term in self.terms)
 
     def potential(self, t: ScalarLike, state: BodyState, args: PyTree) -> Scalar:

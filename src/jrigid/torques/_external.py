@@ -85,8 +85,8 @@ class GravityGradient(AbstractTorque):
 
     First order in body size over distance; n is the direction of the attractor in the
     body, I the inertia about the centre of mass, which the torque receives from the
-    body on which it acts. `GravityGradient(mu, position).of_body(inertia)` can be
-    called without a body.
+    body on which it acts, with that of each `SpinningMass` in the same sum.
+    `GravityGradient(mu, position).of_body(inertia)` can be called without a body.
 
     Attributes:
         mu: Gravitational parameter of the attractor [m^3/s^2].

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jrigid._types import BodyState, Scalar, ScalarLike, Vector
+from jrigid._checks import demand
+from jrigid._types import BodyState, Matrix, Scalar, ScalarLike, Vector
 from jrigid.torques._base import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -23,6 +24,7 @@ from jrigid.torques._base import (
     vector_or_function,
     zero_like,
 )
+from jrigid.torques._sampled import Sampled
 
 
 class InternalDamper(AbstractTorque):
@@ -102,9 +104,14 @@ class Rotor(AbstractTorque):
 
     Attributes:
         momentum: h, relative to the body, body components [kg m^2/s]: an array, or
-            `h(t) -> (3,)`.
+            `h(t) -> (3,)`. It must be continuous and have a derivative: at a step the
+            torque is infinite, and the recoil of the body is missed. A rotor that is
+            switched on in an instant is a `Sampled` with two times a millisecond apart.
 
-    Gradients: finite everywhere; a function of time must be differentiable.
+    Raises:
+        ValueError: The momentum is a `Sampled` with a step.
+
+    Gradients: finite everywhere.
     Source: Hughes, Spacecraft Attitude Dynamics (1986), chapter 6.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -117,6 +124,14 @@ class Rotor(AbstractTorque):
     momentum: Float[Array, "3"] | Callable[[ScalarLike], Vector] = eqx.field(
         **vector_or_function("momentum")
     )
+
+    def __check_init__(self) -> None:
+        """Raise ValueError for a momentum with a known step."""
+        demand(
+            not (isinstance(self.momentum, Sampled) and self.momentum.has_known_step),
+            "Argument `momentum` of `Rotor` must be continuous, but it has a step, "
+            "which takes an infinite torque. Put its two times apart.",
+        )
 
     def __call__(self, t: ScalarLike, state: BodyState, args: PyTree) -> Vector:
         """Torque on the body [N m], body components."""
@@ -141,7 +156,8 @@ class SpinningMass(AbstractTorque):
 
     The wheel's absolute spin s about its axis a is its entry in `State.internal`
     [rad/s]; by default it starts at rest relative to the body. J s' = motor torque. The
-    body's inertia includes the wheel except for its axial moment J about a.
+    body's inertia includes the wheel except for its axial moment J about a, which
+    `GravityGradient` adds, since it acts on the wheel too.
 
     Attributes:
         inertia: J [kg m^2], positive.
@@ -178,6 +194,11 @@ class SpinningMass(AbstractTorque):
         # The motor is fixed to the body, which takes up its reaction.
         push = -self._motor(t, state, args) * axis
         return push - jnp.cross(state.omega, self.internal_momentum(t, state, args))
+
+    @property
+    def inertia_of_parts(self) -> Matrix:
+        """Moment of the wheel about its axis, J a a^T [kg m^2]."""
+        return self.inertia * jnp.outer(self.axis, self.axis)
 
     def internal_at_rest(self, state: BodyState) -> tuple[Scalar]:
         """The wheel turning with the body."""

@@ -73,6 +73,14 @@ class Sampled(Readable):
         """Times at which the function is not smooth: those of the samples [s]."""
         return self.ts + self.delay.astype(self.ts.dtype)
 
+    @property
+    def has_known_step(self) -> bool:
+        """Whether a time occurs twice with two values, as far as these are known."""
+        if not (is_concrete(self.ts) and is_concrete(self.values)):
+            return False
+        same = np.diff(np.asarray(self.ts)) == 0
+        return bool(np.any(np.diff(np.asarray(self.values), axis=0)[same]))
+
     def __call__(self, t: ScalarLike) -> Array:
         """The value at a time."""
         ts = self.ts
