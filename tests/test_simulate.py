@@ -750,7 +750,7 @@ def test_nan_in_a_torque_at_the_start_is_an_error():
         ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, event=lambda t: t),
-            "`event` must be a Event",
+            "`event` must be a `diffrax.Event",
         ),
         (
             lambda b, s: jr.simulate(b, s, 1.0, max_steps=0),
