@@ -55,6 +55,7 @@ MODULES = {
 # Abstract classes, aliases and records: nothing to call.
 NOTHING_TO_CALL = {
     "torques.AbstractTorque",
+    "torques.Sampled.has_known_step",
     "torques.TorqueFunction",
     "systems.AbstractSystem",
     "dynamics.ExactStates",
@@ -599,6 +600,9 @@ CASES = {
         of_internal(torques.InternalDamper),
         (0.2, 0.05, 0.5, ATTITUDE, OMEGA, INNER),
         methods("torques.InternalDamper", *(set(TORQUE_METHODS) - {"potential"})),
+    ),
+    "torques.SpinningMass.inertia_of_parts": Case(
+        lambda i, axis: torques.SpinningMass(i, axis).inertia_of_parts, (0.3, AXIS)
     ),
     "torques.SpinningMass": Case(
         of_internal(lambda i, axis: torques.SpinningMass(i, axis, motor)),
