@@ -57,8 +57,9 @@ def integrals(
     k c G|^2, and that of Goryachev and Chaplygin omega3 |w|^2 - k gamma3 Re(c* w).
 
     Args:
-        body: A `SymmetricTop`, a body under `torques.UniformGravity` alone, or one
-            without a torque; moments, not a tensor, where a case is requested.
+        body: A `SymmetricTop`, a body under `torques.UniformGravity` alone, or for
+            "euler" one without a torque; moments, not a tensor, where a case is
+            requested.
         state: Any state of the motion.
         case: "euler" (no torque), "lagrange" (I1 = I2, lever along axis 3),
             "kovalevskaya" (I1 = I2 = 2 I3, lever across axis 3), "goryachev-chaplygin"
@@ -89,7 +90,8 @@ def integrals(
         body = body.as_rigid_body()
     check_type("body", body, RigidBody)
     gravity = body.torque
-    if body.is_free:
+    # Without gravity no direction is vertical, which only Euler's case does not need.
+    if body.is_free and case == "euler":
         zero = jnp.zeros(3, body.inertia.dtype)
         gravity = UniformGravity(zero[0], zero, zero)
     check_type("body.torque", gravity, UniformGravity)
