@@ -153,7 +153,7 @@ class MassProperties(Readable):
         >>> print(ball.about(jnp.zeros(3))[2, 2])
         3.0
         """
-        body, place = _in_one_dtype(self, *float_arrays(point))
+        body, place = _in_one_dtype(self, point)
         check_shape("point", place, (3,))
         return parallel_axis(body.inertia, body.mass, place - body.center_of_mass)
 
@@ -173,7 +173,7 @@ class MassProperties(Readable):
         >>> print(ball.translated(jnp.array([0.0, 2.0, 0.0])).center_of_mass)
         [0. 2. 0.]
         """
-        body, shift = _in_one_dtype(self, *float_arrays(displacement))
+        body, shift = _in_one_dtype(self, displacement)
         check_shape("displacement", shift, (3,))
         center = body.center_of_mass + shift
         return MassProperties.unchecked(body.mass, center, body.inertia)
@@ -196,7 +196,7 @@ class MassProperties(Readable):
         >>> print(turned.center_of_mass.round(6)[2])
         -1.0
         """
-        body, turn = _in_one_dtype(self, *float_arrays(attitude))
+        body, turn = _in_one_dtype(self, attitude)
         check_shape("attitude", turn, (4,))
         return _rotated(body, turn)
 
@@ -237,7 +237,7 @@ def _symmetrised(tensor: Matrix) -> Matrix:
 
 def _in_one_dtype(*trees: Any) -> Any:
     # Under strict promotion a float32 body and a float64 vector would be an error.
-    leaves, structure = jtu.tree_flatten(trees)
+    leaves, structure = jtu.tree_flatten(trees, lambda x: isinstance(x, list))
     return jtu.tree_unflatten(structure, float_arrays(*leaves))
 
 
