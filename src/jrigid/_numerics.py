@@ -202,6 +202,11 @@ _EXACT = jax.lax.Precision.HIGHEST
 _WORTH_A_PLAN = 1000  # numbers of an array, where numpy's plan for a product pays
 
 
+def as_tensor(inertia: AnyArray) -> AnyArray:
+    """The tensor of principal moments, or the tensor itself."""
+    return inertia.__array_namespace__().diag(inertia) if inertia.ndim == 1 else inertia
+
+
 def product(subscripts: str, *operands: AnyArray) -> AnyArray:
     """`einsum` in full precision on every device; numpy's if all arrays are numpy's."""
     if not all(isinstance(x, np.ndarray) for x in operands):

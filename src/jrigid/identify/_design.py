@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import INERTIA, check_shape, check_type, demand, nan_where
 from jrigid._core.compile import Static, program, small_jit
-from jrigid._numerics import or_one, product
+from jrigid._numerics import as_tensor, or_one, product
 from jrigid._types import AnyArray, Matrix, Readable, Real, Scalar
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
@@ -24,7 +24,7 @@ from jrigid.identify import _problem as problems
 from jrigid.identify._disturbance import no_disturbance
 from jrigid.identify._errors import conclude
 from jrigid.identify._flow import needs_attitude
-from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor, as_tensor
+from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
 from jrigid.identify._layout import Layout, first_and_last, whole
 from jrigid.identify._minimise import (

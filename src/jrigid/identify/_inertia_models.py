@@ -22,11 +22,6 @@ LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"
 BOUNDARY = 1e-7
 
 
-def as_tensor(inertia: AnyArray) -> AnyArray:
-    """The tensor of principal moments, or the tensor itself."""
-    return inertia.__array_namespace__().diag(inertia) if inertia.ndim == 1 else inertia
-
-
 def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:
     """Second moments of trace 1 of the nearest body with extent in three directions.
 

@@ -22,10 +22,10 @@ from jrigid._checks import (
     settle,
 )
 from jrigid._core.compile import small_program
-from jrigid._numerics import or_one, rms, without_gradient
+from jrigid._numerics import as_tensor, or_one, rms, without_gradient
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
-from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
+from jrigid.identify._inertia_models import AbstractInertiaModel
 from jrigid.identify._layout import DirectReadings
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor

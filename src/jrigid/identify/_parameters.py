@@ -15,7 +15,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._core.compile import one_program
-from jrigid._numerics import product
+from jrigid._numerics import as_tensor, product
 from jrigid._types import InertiaLike, Matrix, Real, Scalar, Vector
 from jrigid.mass import MassProperties, inertia_of_second_moment, second_moment
 
@@ -107,7 +107,7 @@ def parameters_from_inertia(inertia: InertiaLike) -> Float[Array, "6"]:
      [0.  0.  2.5]]
     """
     (inertia,) = shaped(inertia=(inertia, *INERTIA))
-    tensor = jnp.diag(inertia) if inertia.ndim == 1 else inertia
+    tensor = as_tensor(inertia)
     second = second_moment(0.5 * (tensor + tensor.T))
     # The second moments of a body with extent in three directions are positive
     # definite, as an inertia is, so that one check serves both.

@@ -20,10 +20,10 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, PyTree
 
 from jrigid._checks import demand, is_concrete, whole_number
-from jrigid._numerics import or_one, product, without_gradient
+from jrigid._numerics import as_tensor, or_one, product, without_gradient
 from jrigid._types import AnyArray, Readable, Real
 from jrigid.identify._host import cholesky
-from jrigid.identify._inertia_models import AbstractInertiaModel, as_tensor
+from jrigid.identify._inertia_models import AbstractInertiaModel
 from jrigid.identify._parameters import SIDES, squared
 from jrigid.identify._records import one_after_another
 from jrigid.identify._sensors import AbstractSensor

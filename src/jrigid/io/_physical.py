@@ -5,6 +5,7 @@ import numpy as np
 
 from jrigid._checks import INERTIA, shaped
 from jrigid._core.compile import one_program
+from jrigid._numerics import as_tensor
 from jrigid._types import InertiaLike, Matrix, ScalarLike
 from jrigid.mass import (
     MassProperties,
@@ -211,7 +212,7 @@ def nearest_physical(
     """
     known = {"inertia": (inertia, *INERTIA), "mass": (mass,), "thickness": (thickness,)}
     tensor, mass, thickness = shaped(**known)
-    tensor = jnp.diag(tensor) if tensor.ndim == 1 else tensor
+    tensor = as_tensor(tensor)
     tensor = 0.5 * (tensor + tensor.T)
     least = mass * thickness * thickness / 12
     added = tensor_function(lambda x: jnp.maximum(least - x, 0), second_moment(tensor))

@@ -19,6 +19,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._core.compile import one_program
+from jrigid._numerics import as_tensor
 from jrigid._spectral import eigh, spectral_function
 from jrigid._types import (
     InertiaLike,
@@ -34,10 +35,10 @@ from jrigid._types import (
 ULPS = 64
 
 
-def as_tensor(inertia: Array) -> Matrix:
-    """Make a tensor of principal moments; return a tensor as it is."""
+def _checked_tensor(inertia: Array) -> Matrix:
+    """The tensor of moments or of a tensor, or ValueError for another shape."""
     check_shape("inertia", inertia, *INERTIA)
-    return jnp.diag(inertia) if inertia.ndim == 1 else inertia
+    return as_tensor(inertia)
 
 
 def inertia_of_second_moment(second: Matrix) -> Matrix:
@@ -133,7 +134,7 @@ def body_arrays(
     inertia, mass, value = shaped(
         inertia=(inertia, *INERTIA), mass=(mass,), **{name: (value, 3)}
     )
-    return as_tensor(inertia), mass, value
+    return _checked_tensor(inertia), mass, value
 
 
 def _from_center(tensor: Matrix, mass: Scalar, displacement: Vector) -> Matrix:
@@ -257,7 +258,7 @@ def principal_axes(inertia: InertiaLike) -> PrincipalAxes:
     >>> print(jr.principal_axes(jnp.array([3.0, 1.0, 2.0])).moments)
     [1. 2. 3.]
     """
-    tensor = as_tensor(float_arrays(inertia)[0])
+    tensor = _checked_tensor(float_arrays(inertia)[0])
     return where_defined(
         is_symmetric(tensor), lambda x: PrincipalAxes(*eigh(x)), tensor
     )
@@ -295,7 +296,7 @@ def tensor_function(f: Callable[[Scalar], Scalar], inertia: InertiaLike) -> Matr
      [0.   0.25 0.  ]
      [0.   0.   0.25]]
     """
-    tensor = as_tensor(float_arrays(inertia)[0])
+    tensor = _checked_tensor(float_arrays(inertia)[0])
     moment = jax.ShapeDtypeStruct((), tensor.dtype)
     shape = jax.eval_shape(f, moment)
     if getattr(shape, "shape", None) != () or shape.dtype != tensor.dtype:

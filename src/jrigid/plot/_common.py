@@ -10,6 +10,7 @@ from jaxtyping import Array
 from jrigid._checks import INERTIA, demand, kind_of
 from jrigid._extra import extra
 from jrigid._motion import HasRigidBody
+from jrigid._numerics import as_tensor
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.mass import principal_axes
@@ -107,7 +108,7 @@ def tensor_of(body: Body) -> np.ndarray:
     inertia = np.asarray(system.inertia if isinstance(system, HasInertia) else system)
     wrong = f"Argument `body` must have or be an inertia, but it is {kind_of(body)}."
     demand(inertia.dtype.kind in "iuf" and inertia.shape in INERTIA, wrong)
-    return (np.diag(inertia) if inertia.ndim == 1 else inertia).astype(float)
+    return as_tensor(inertia).astype(float)
 
 
 def principal(body: Body) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ from jrigid._checks import (
     is_concrete,
     jumps_within,
 )
-from jrigid._numerics import safe_norm
+from jrigid._numerics import as_tensor, safe_norm
 from jrigid._types import (
     BodyState,
     InertiaLike,
@@ -407,8 +407,7 @@ class Sum(AbstractTorque):
         parts = [x.inertia_of_parts for x in self.terms]
         parts = [x for x in parts if x is not None]
         if parts:
-            own = array_of_shape("inertia", inertia, *INERTIA)
-            tensor = jnp.diag(own) if own.ndim == 1 else own
+            tensor = as_tensor(array_of_shape("inertia", inertia, *INERTIA))
             inertia = sum((x.astype(tensor.dtype) for x in parts), tensor)
         return Sum(term.of_body(inertia) for term in self.terms)
 
