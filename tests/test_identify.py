@@ -13,9 +13,9 @@ from jrigid import identify
 from jrigid.identify import _starts as starts
 from jrigid.identify._flow import free_flow
 from jrigid.identify._inputs import sizes_of
-from jrigid.identify._layout import direct_readings_of
 from jrigid.identify._problem import Options, Problem
 from jrigid.identify._quality import signal_of
+from jrigid.identify._readings import direct_readings_of
 from jrigid.identify._records import of_trials, samples_of
 from jrigid.identify._unknowns import unknowns_of
 

@@ -26,7 +26,7 @@ from jrigid.identify._errors import conclude
 from jrigid.identify._flow import needs_attitude
 from jrigid.identify._inertia_models import AbstractInertiaModel, Tensor
 from jrigid.identify._inputs import refuse, sizes_of, typical_rate
-from jrigid.identify._layout import Layout, first_and_last, whole
+from jrigid.identify._layout import Layout, whole
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
     FIRST_GROWTH,
@@ -35,7 +35,13 @@ from jrigid.identify._minimise import (
     Settings,
 )
 from jrigid.identify._quality import Fit
-from jrigid.identify._records import Record, Samples, of_trials, samples_of
+from jrigid.identify._records import (
+    Record,
+    Samples,
+    first_and_last,
+    of_trials,
+    samples_of,
+)
 from jrigid.identify._result import FitResult, demand_single, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
 from jrigid.identify._smoother import Links, Point, Rows

@@ -36,13 +36,8 @@ from jrigid.identify._inputs import (
     typical_rate,
 )
 from jrigid.identify._layout import (
-    DirectReadings,
     Layout,
-    angle_turned,
-    direct_readings_of,
-    longest_turn,
     node_states,
-    other_way_round,
     segments,
     segments_needed,
     whole,
@@ -50,6 +45,13 @@ from jrigid.identify._layout import (
 from jrigid.identify._minimise import tensors_at
 from jrigid.identify._problem import Options, Problem
 from jrigid.identify._quality import Fit
+from jrigid.identify._readings import (
+    DirectReadings,
+    angle_turned,
+    direct_readings_of,
+    longest_turn,
+    other_way_round,
+)
 from jrigid.identify._reasons import reason
 from jrigid.identify._records import (
     Record,

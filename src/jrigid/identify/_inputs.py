@@ -26,7 +26,7 @@ from jrigid._numerics import as_tensor, or_one, rms, without_gradient
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._inertia_models import AbstractInertiaModel
-from jrigid.identify._layout import DirectReadings
+from jrigid.identify._readings import DirectReadings
 from jrigid.identify._records import Record, Samples, check_records, tells
 from jrigid.identify._sensors import MomentumSensor
 from jrigid.systems import RigidBody

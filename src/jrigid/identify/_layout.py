@@ -1,26 +1,20 @@
 """How a record is divided into segments, and the states at which they begin."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jrigid._core.compile import Static, small_program
 from jrigid._types import AnyArray
-from jrigid.identify._host import conjugate, exp, log, multiply, normalize
-from jrigid.identify._records import Record, Samples, first_and_last, tells
-from jrigid.identify._sensors import AbstractSensor
+from jrigid.identify._readings import (
+    DirectReadings,
+    angle_turned,
+    index_before,
+    turned_by,
+)
+from jrigid.identify._records import Samples, first_and_last
 
 MOST_NODES = 2000  # of a trial, where each sample has one
-# An attitude so many times as far from the path of its neighbours as others are from
-# that of theirs is no place to begin a segment.
-_LONE = 8.0
-# Intervals that differ by more than this part are no equal ones.
-_UNEVEN = 0.1
-# Radians from one attitude to the next, twelve samples a turn.
-_SMALL_TURN = 0.5
 
 
 class Layout(NamedTuple):
@@ -43,265 +37,6 @@ class Layout(NamedTuple):
     end: AnyArray
     linked: AnyArray
     since: AnyArray
-
-
-class DirectReadings(NamedTuple):
-    """Rates, and attitudes if there are any, that records give without a model.
-
-    Attributes:
-        ts: Times (trials, n) [s]; zero where there is no reading.
-        valid: Whether there is a reading (trials, n).
-        omega: Rates in body axes (trials, n, 3) [rad/s].
-        attitude: Attitudes (trials, n, 4).
-    """
-
-    ts: np.ndarray
-    valid: np.ndarray
-    omega: np.ndarray
-    attitude: np.ndarray | None
-
-
-class _Series(NamedTuple):
-    """What one sensor reads directly: times, whether there is a reading, values."""
-
-    ts: np.ndarray
-    valid: np.ndarray
-    values: np.ndarray
-
-
-def _index_before(valid: np.ndarray) -> np.ndarray:
-    """Index of the last valid sample before each sample; -1 up to the first one."""
-    index = np.where(valid, np.arange(valid.shape[-1]), -1)
-    latest = np.maximum.accumulate(index, axis=-1)
-    none = np.full_like(latest[..., :1], -1)
-    return np.concatenate([none, latest[..., :-1]], axis=-1)
-
-
-def _index_after(valid: np.ndarray) -> np.ndarray:
-    """Index of the first valid sample after each sample; the count from the last on."""
-    reverse = _index_before(valid[..., ::-1])[..., ::-1]
-    return valid.shape[-1] - 1 - reverse
-
-
-def _nearest_before(ts: np.ndarray, valid: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Index of the last valid sample up to each t, or of the first one."""
-    # The search needs ordered times: where there is no reading the latest one is
-    # repeated.
-    times = np.maximum.accumulate(np.where(valid, ts, -np.inf))
-    after = np.searchsorted(times, t, side="right")
-    latest = _index_before(np.append(valid, False))[after]
-    return np.where(latest < 0, np.argmax(valid), latest)
-
-
-def _mean_rates(
-    ts: np.ndarray, attitude: np.ndarray, start: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean rates between samples, and between which of them time passes.
-
-    Args:
-        ts: Times.
-        attitude: At these times.
-        start: Indices of samples, -1 where there is none.
-        end: Indices of later ones, the count of samples where there is none.
-
-    Returns:
-        Rates (n, 3), zero where no time passes, and a mask (n, 1).
-    """
-    both = (start >= 0) & (end < ts.size)
-    start = np.where(both, start, 0)
-    end = np.where(both, end, 0)
-    step = ts[end] - ts[start]
-    passes = (both & (step > 0))[:, None]
-    turn = log(multiply(conjugate(attitude[start]), attitude[end]))
-    rates = np.where(passes, turn / np.where(passes, step[:, None], 1.0), 0.0)
-    return rates, passes
-
-
-def _rates_from_attitudes(
-    ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray
-) -> np.ndarray:
-    """Rates of a trial: at each sample the mean of the rates before and after it."""
-    index = np.arange(ts.size)
-    # A turn between samples divided by its time is the rate in their middle. The mean
-    # of both sides is more accurate at the sample itself.
-    left, has_left = _mean_rates(ts, attitude, _index_before(valid), index)
-    right, has_right = _mean_rates(ts, attitude, index, _index_after(valid))
-    return (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
-
-
-def _turns(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Integral of rates (n, k) of a trial since the sample before (trapezium rule)."""
-    last = _index_before(valid)
-    step = np.where(valid & (last >= 0), np.maximum(ts - ts[last], 0.0), 0.0)
-    return 0.5 * (rates[last] + rates) * step[:, None]
-
-
-def _turned_by(
-    attitude: np.ndarray, rates: np.ndarray, duration: np.ndarray
-) -> np.ndarray:
-    """Attitudes after a duration at constant rates."""
-    return multiply(attitude, exp(rates * duration[..., None]))
-
-
-def _dead_reckoning(
-    ts: np.ndarray,
-    valid: np.ndarray,
-    omega: np.ndarray,
-    attitude_ts: np.ndarray,
-    attitude_valid: np.ndarray,
-    attitude: np.ndarray,
-) -> np.ndarray:
-    """Attitudes of a trial at times of rates, each from the last observed attitude."""
-    # Before the first attitude the motion is followed back from it.
-    latest = _nearest_before(attitude_ts, attitude_valid, ts)
-    # A missing rate has no time. It continues from the attitude of the rate before it,
-    # and from none (-1) before the first rate.
-    latest = np.maximum.accumulate(np.where(valid, latest, -1))
-    observed = _turned_by(attitude[latest], omega, ts - attitude_ts[latest])
-    # The first rate after a new attitude starts anew; the others add their turns.
-    is_first = np.diff(latest, prepend=-2) != 0
-    factors = np.where(is_first[:, None], observed, exp(_turns(ts, valid, omega)))
-    return normalize(_running_products(factors, is_first))
-
-
-def _running_products(factors: np.ndarray, is_first: np.ndarray) -> np.ndarray:
-    """Products of quaternions, at each index from the last first factor up to there.
-
-    They are formed by doubling: after k rounds each is the product of the last 2^k
-    factors, or of all since the first one.
-    """
-    # Doubling takes log2(n) products of whole arrays, a loop over samples n products.
-    product = factors.copy()
-    complete = is_first
-    shift = 1
-    while not np.all(complete):
-        longer = multiply(product[:-shift], product[shift:])
-        product[shift:] = np.where(complete[shift:, None], product[shift:], longer)
-        complete = np.concatenate(
-            [complete[:shift], complete[shift:] | complete[:-shift]]
-        )
-        shift *= 2
-    return product
-
-
-@small_program
-def _apply_method(sensor: AbstractSensor, name: Static, values: AnyArray) -> jax.Array:
-    """Apply a method of a sensor, "rates" or "attitude", to values (trials, n, k)."""
-    return jax.vmap(jax.vmap(getattr(sensor, name.value)))(values)
-
-
-def _first_series(
-    records: tuple[Record, ...], samples: Samples, name: str
-) -> _Series | None:
-    """What the first record reads that has "rates" or "attitude"; None without one."""
-    for record, values, part in zip(
-        records, samples.values, samples.parts, strict=True
-    ):
-        if not tells(record, name):
-            continue
-        direct = np.asarray(_apply_method(record.sensor, Static(name), values))
-        # A saturated value is a bound only.
-        exact = (samples.weight[:, part] > 0) & (samples.sign[:, part] == 0)
-        valid = np.all(exact, axis=-1)
-        return _Series(np.where(valid, samples.ts[:, part], 0.0), valid, direct)
-    return None
-
-
-def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Which attitudes of a trial leap from the path of those before and after them."""
-    place = np.flatnonzero(valid)
-    t = ts[place]
-    q = attitude[place]
-    if t.size < 5:
-        return np.zeros_like(valid)
-    span = t[2:] - t[:-2]
-    part = (t[1:-1] - t[:-2]) / np.where(span > 0, span, 1.0)
-    turn = log(multiply(conjugate(q[:-2]), q[2:]))
-    path = multiply(q[:-2], exp(part[:, None] * turn))
-    off = np.linalg.norm(log(multiply(conjugate(path), q[1:-1])), axis=1)
-    # A leap also bends the paths at its neighbours, by half as much.
-    around = np.pad(off, 1)
-    largest = (off >= around[:-2]) & (off >= around[2:])
-    result = np.zeros_like(valid)
-    result[place[1:-1]] = largest & (off > _LONE * np.median(off))
-    return result
-
-
-def direct_readings_of(
-    records: tuple[Record, ...],
-    samples: Samples,
-    attitude0: np.ndarray | None,
-    robust: bool = False,
-) -> DirectReadings | None:
-    """Return the rates and attitudes that records give directly, None without either.
-
-    Args:
-        records: Records with numpy arrays.
-        samples: Samples of the records.
-        attitude0: Attitude at the first sample of each trial, for dead reckoning where
-            none was observed.
-        robust: Whether attitudes that leap for a single sample are passed over.
-    """
-    rates = _first_series(records, samples, "rates")
-    attitudes = _first_series(records, samples, "attitude")
-    if attitudes is not None and robust:
-        lone = _for_each_trial(_lone, *attitudes)
-        attitudes = attitudes._replace(valid=attitudes.valid & ~lone)
-    if rates is None:
-        if attitudes is None:
-            return None
-        ts, valid, attitude = attitudes
-        omega = _for_each_trial(_rates_from_attitudes, *attitudes)
-        return DirectReadings(ts, valid, omega, attitude)
-    ts, valid, omega = rates
-    # A missing reading is not zero after the sensor's bias is subtracted.
-    omega = np.where(valid[..., None], omega, 0.0)
-    if attitudes is None and attitude0 is not None:
-        start = first_and_last(ts, valid)[0][:, None]
-        attitudes = _Series(start, np.ones_like(start, bool), attitude0[:, None])
-    if attitudes is None:
-        return DirectReadings(ts, valid, omega, None)
-    attitude = _for_each_trial(_dead_reckoning, ts, valid, omega, *attitudes)
-    return DirectReadings(ts, valid, omega, attitude)
-
-
-def _for_each_trial(
-    function: Callable[..., np.ndarray], *arrays: np.ndarray
-) -> np.ndarray:
-    """Apply a function of a trial's arrays to each trial and stack the results."""
-    return np.stack([function(*trial) for trial in zip(*arrays, strict=True)])
-
-
-def angle_turned(readings: DirectReadings) -> np.ndarray:
-    """Angle turned up to each sample (trials, n) [rad], by the trapezium rule."""
-    omega = readings.omega
-    speed = np.sqrt(np.sum(omega * omega, axis=-1, keepdims=True))
-    speed = np.where(readings.valid[..., None], speed, 0.0)
-    turns = _for_each_trial(_turns, readings.ts, readings.valid, speed)
-    return np.cumsum(turns[..., 0], axis=1)
-
-
-def longest_turn(readings: DirectReadings) -> float:
-    """Largest angle turned from one sample to the next [rad]."""
-    return float(np.max(np.diff(angle_turned(readings), axis=1), initial=0.0))
-
-
-def other_way_round(readings: DirectReadings) -> DirectReadings | None:
-    """Readings of a motion that turns the other way from each attitude to the next.
-
-    Attitudes at equal intervals are those of such a motion too, an alias. None where
-    intervals differ, or where turns are so small that nobody would think of it.
-    """
-    steps = [np.diff(t[x]) for t, x in zip(readings.ts, readings.valid, strict=True)]
-    steps = np.concatenate(steps)
-    step = np.median(steps) if steps.size else 0.0
-    if not step > 0 or np.max(np.abs(steps - step)) > _UNEVEN * step:
-        return None
-    speed = np.linalg.norm(readings.omega, axis=-1, keepdims=True)
-    if step * np.median(speed[readings.valid]) < _SMALL_TURN:
-        return None
-    factor = 1 - 2 * np.pi / (step * np.where(speed > 0, speed, np.inf))
-    return readings._replace(omega=(factor * readings.omega).astype(speed.dtype))
 
 
 def whole(samples: Samples, nodes: int, t0: AnyArray | None = None) -> Layout:
@@ -385,7 +120,7 @@ def _segments_of_trial(
         The layout, and the index of the direct reading at each node (nodes,).
     """
     nodes = layout.start.size
-    last = _index_before(valid)
+    last = index_before(valid)
     opens = np.flatnonzero(valid & ((last < 0) | (number != number[last])))
     reading = np.zeros(nodes, int)
     reading[: opens.size] = opens[:nodes]
@@ -420,7 +155,7 @@ def node_states(
         return omega, None
     # Zero, except at the first node, which stands at the first sample of any record.
     late = start - readings.ts[trial, reading]
-    return omega, _turned_by(readings.attitude[trial, reading], omega, late)
+    return omega, turned_by(readings.attitude[trial, reading], omega, late)
 
 
 def segments_needed(angle: float, samples: int, length: float) -> int:

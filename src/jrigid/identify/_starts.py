@@ -30,8 +30,8 @@ from jrigid._types import AnyArray, Matrix, Readable, Real, Vector
 from jrigid.dynamics import State
 from jrigid.identify import _host as host
 from jrigid.identify._inertia_models import LogCholesky
-from jrigid.identify._layout import DirectReadings
 from jrigid.identify._problem import Options
+from jrigid.identify._readings import DirectReadings
 from jrigid.identify._records import first_and_last
 from jrigid.identify._unknowns import Unknowns
 

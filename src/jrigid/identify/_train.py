@@ -22,8 +22,8 @@ from jrigid.dynamics import State
 from jrigid.identify._flow import forced_flow, needs_attitude
 from jrigid.identify._host import on_host
 from jrigid.identify._inputs import judge
-from jrigid.identify._layout import direct_readings_of, longest_turn
 from jrigid.identify._problem import Options, shown_by, whitened
+from jrigid.identify._readings import direct_readings_of, longest_turn
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.identify._sensors import AbstractSensor
 from jrigid.rotation import exp, multiply
