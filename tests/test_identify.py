@@ -401,6 +401,54 @@ def test_attitudes_between_two_observed_ones_follow_the_rates(missing):
     assert np.max(turn.magnitude()) < 2e-3
 
 
+def noisy_attitudes(rng, ts, moments, omega, sigma):
+    """Attitudes of a free body with noise [rad], and its rates."""
+    start = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.asarray(omega))
+    motion = jr.free_rotation(jnp.asarray(moments), start, jnp.asarray(ts))
+    noise = Rotation.from_rotvec(sigma * rng.normal(size=(ts.size, 3)))
+    turns = Rotation.from_quat(np.asarray(motion.attitude), scalar_first=True)
+    attitudes = (turns * noise).as_quat(scalar_first=True)
+    record = identify.Attitudes(ts, attitudes, max(sigma, 1e-6))
+    return record, np.asarray(motion.omega)
+
+
+@pytest.mark.parametrize(
+    ("step", "sigma", "bar"),
+    [
+        (1e-3, 5e-3, 0.05),  # rates between neighbours would be 5 rad/s off
+        (1e-3, 0.0, 0.02),
+        (5e-3, 5e-3, 0.06),
+        (0.05, 0.0, 0.02),  # too far apart for parabolas
+    ],
+)
+def test_rates_from_attitudes_however_close_they_are(rng, step, sigma, bar):
+    ts = np.delete(np.arange(0.0, 3.0, step), slice(10, 14))
+    # A gap of .4 s, through which the body turns by two radians.
+    ts = ts[(ts < 1.0) | (ts > 1.4)]
+    record, omega = noisy_attitudes(rng, ts, [1.0, 1.5, 2.0], [2.0, 4.0, 1.0], sigma)
+    values = np.array(record.values)
+    values[20] = np.nan  # one reading is missing
+    records = jax.tree.map(
+        np.asarray, of_trials(record.with_values(jnp.asarray(values)))
+    )
+    readings = direct_readings_of(records, samples_of(records, np.ones(())), None)
+    seen = readings.valid[0]
+    off = np.linalg.norm(readings.omega[0] - omega, axis=1) / np.linalg.norm(omega[0])
+    assert np.sum(~seen) == 1
+    # Rates are less accurate at the ends, and worthless at a gap beside few attitudes.
+    assert np.quantile(off[seen], 0.95) < bar
+
+
+def test_a_fit_of_attitudes_a_millisecond_apart(rng):
+    record, _ = noisy_attitudes(
+        rng, np.arange(0.0, 3.0, 1e-3), [1.0, 1.5, 2.0], [2.0, 4.0, 1.0], 5e-3
+    )
+    found = identify.fit(jr.RigidBody(jnp.ones(3)), record, throw=True)
+    assert found.status == identify.Status.OK
+    off = (found.ratios - np.array([1.5, 2.0])) / found.ratios_errors
+    assert np.max(np.abs(off)) < 4
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_flow_has_the_same_value_with_its_derivative(dtype):
     """Also of a symmetric body, whose moments are moved apart in the derivative."""

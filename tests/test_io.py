@@ -295,6 +295,15 @@ def test_a_file_of_a_mesh_that_is_cut_off_is_named(rng, tmp_path, suffix, part):
         jr.io.read_mesh(path)
 
 
+@pytest.mark.parametrize("end", ["f", "f 2", "f 2 4"])
+def test_an_obj_cut_off_in_its_first_face_holds_no_face(tmp_path, end):
+    text = trimesh.exchange.obj.export_obj(trimesh.creation.box((1, 2, 3)))
+    path = tmp_path / "box.obj"
+    path.write_text(text[: text.index("f ")] + end)
+    with pytest.raises(ValueError, match=r"hold(s no mesh| at least one face)"):
+        jr.io.read_mesh(path)
+
+
 def test_a_mesh_must_be_a_file_and_its_faults_name_the_file(rng, tmp_path):
     for path in (tmp_path, tmp_path / "none.stl"):
         with pytest.raises(ValueError, match=r"`path` must be a file, but .* is none"):
@@ -704,6 +713,14 @@ def test_what_is_wrong_in_a_file_is_said_with_its_name(tmp_path, text, match):
             jr.io.write_inertials(tmp_path / "c.urdf", {}, template=path)
 
 
+def test_a_suffix_must_be_that_of_the_template(tmp_path):
+    text = urdf(f"<inertial><mass value='1'/><inertia {SIX}/></inertial>")
+    with pytest.raises(
+        ValueError, match=r"'b\.sdf' would hold a template of root <rob"
+    ):
+        jr.io.write_inertials(tmp_path / "b.sdf", {}, template=text)
+
+
 def test_a_file_that_is_not_there_is_no_empty_text(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.urdf"):
         jr.io.read_inertials(tmp_path / "none.urdf")
@@ -842,6 +859,24 @@ def test_what_mujoco_refuses_is_refused(text, match):
                 "inertiafromgeom='true'",
             ),
             "overlook",
+        ),
+        (
+            mjcf(
+                "<inertial mass='1' pos='0 0 0' diaginertia='1 1 1'/>",
+                "coordinate='global'",
+            ),
+            "global coordinates",
+        ),
+        (
+            urdf(
+                f"<inertial><mass value='1'/><inertia {SIX}/>"
+                "<origin xyz='0 0 1'/><origin xyz='0 0 2'/></inertial>"
+            ),
+            "it has two <origin>",
+        ),
+        (
+            sdf("<pose>0 0 1 0 0 0</pose><!-- or --><pose>0 0 2 0 0 0</pose>"),
+            "it has two <pose>",
         ),
         (sdf("<pose relative_to='m'>0 0 0 0 0 0</pose>"), "relative to the link"),
         (

@@ -629,6 +629,12 @@ def test_spellings_of_units(stated, factor):
     np.testing.assert_allclose(read(table(names, ROWS)).rates, factor * ROWS[:, 1:])
 
 
+def test_a_unit_may_be_the_end_of_a_name():
+    names = ["t_s", *(f"g{a}_mdps" for a in "xyz")]
+    rates = read(table(names, ROWS)).rates
+    np.testing.assert_allclose(rates, 1e-3 * DEGREE * ROWS[:, 1:])
+
+
 @pytest.mark.parametrize(("stated", "most"), [("deg/s", 12100), ("rad/s", 200)])
 def test_rates_beyond_every_gyro_are_asked_about(stated, most):
     names = ["t (s)", *(f"gyro {a} ({stated})" for a in "xyz")]
@@ -947,6 +953,18 @@ def test_gaps_are_breaks_and_are_not_filled():
     assert clock.breaks == (50, 190)
     assert clock.notes == ("2 gaps, the longest of 0.51 s after 1.99 s",)
     assert jr.records.repair(times, gap=2.5).breaks == (50, 190, 210)
+
+
+@pytest.mark.parametrize("rows_of_a_tick", [2, 5, 10, 20, 50])
+def test_many_rows_that_share_a_tick_of_the_clock_are_all_kept(rows_of_a_tick, rng):
+    true = 1e-3 * np.arange(3000)
+    ticks = 1e-3 * rows_of_a_tick * (np.arange(3000) // rows_of_a_tick)
+    clock = jr.records.repair(ticks, rng.normal(size=(3000, 3)))
+    np.testing.assert_array_equal(clock.rows, np.arange(3000))
+    # The line through 60 ticks is worse known than that through 1,500.
+    np.testing.assert_allclose(np.diff(clock.times), 1e-3, rtol=1e-3)
+    assert np.ptp(clock.times - true) < 1e-3 * rows_of_a_tick
+    assert f"rounded to {rows_of_a_tick} ms" in clock.notes[-1]
 
 
 @pytest.mark.parametrize("interval", [0.4e-3, 0.625e-3, 1.7e-3, 3.3e-3])

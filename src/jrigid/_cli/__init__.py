@@ -243,7 +243,13 @@ def _fit(options: argparse.Namespace) -> int:
     result = fit(throw=False)
     if result.status == Status.BAD_INPUT:
         result = fit(throw=True)  # raises an error that says what is wrong
-    print(_with_options(str(result)))
+    report = str(result)
+    if options.sigma is None:
+        # The noise was measured where the body rests.
+        report = report.replace(
+            "`sigma` is too", "the noise at rest, for `sigma`, is too"
+        )
+    print(_with_options(report))
     if options.save:
         identify.save(options.save, result)
     if options.plot:

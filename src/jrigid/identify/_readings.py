@@ -19,6 +19,11 @@ _LONE = 8.0
 _UNEVEN = 0.1
 # Radians from one attitude to the next, twelve samples a turn.
 _SMALL_TURN = 0.5
+# Rates are taken from the attitudes within a turn that is so little [rad] ...
+_LITTLE = 0.25
+_NEARLY_ALWAYS = 0.95
+# ... where there are so many of them on each side.
+_CLOSE = 8
 
 
 class DirectReadings(NamedTuple):
@@ -96,13 +101,64 @@ def _mean_rates(
 def _rates_from_attitudes(
     ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray
 ) -> np.ndarray:
-    """Rates of a trial: at each sample the mean of the rates before and after it."""
+    """Rates of a trial at its attitudes."""
     index = np.arange(ts.size)
     # A turn between samples divided by its time is the rate in their middle. The mean
     # of both sides is more accurate at the sample itself.
     left, has_left = _mean_rates(ts, attitude, index_before(valid), index)
     right, has_right = _mean_rates(ts, attitude, index, _index_after(valid))
-    return (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
+    rates = (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
+    # Noise hides the turns between samples that follow each other closely.
+    place = np.flatnonzero(valid)
+    reach = _reach(attitude[place])
+    if reach >= _CLOSE:
+        slopes, known = _slopes(ts[place], attitude[place], reach)
+        rates[place] = np.where(known, slopes, rates[place])
+    return rates
+
+
+def _reach(attitude: np.ndarray) -> int:
+    """The most samples, a power of two, that the body nearly always turns little in."""
+    reach = 1
+    while 2 * reach < len(attitude):
+        turn = log(multiply(conjugate(attitude[: -2 * reach]), attitude[2 * reach :]))
+        if np.quantile(np.linalg.norm(turn, axis=1), _NEARLY_ALWAYS) > _LITTLE:
+            break
+        reach *= 2
+    return reach
+
+
+def _slopes(
+    ts: np.ndarray, attitude: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rates (n, 3) from parabolas through the turns to samples nearby.
+
+    Args:
+        ts: Times.
+        attitude: At these times.
+        reach: How many samples before and after take part, or every second, fourth
+            and so on of them.
+
+    Returns:
+        The rates, and where there are enough samples for one (n, 1).
+    """
+    offsets = np.arange(-reach, reach + 1, max(1, reach // _CLOSE))
+    index = np.arange(ts.size)[:, None] + offsets
+    exists = (index >= 0) & (index < ts.size)
+    index = np.clip(index, 0, ts.size - 1)
+    width = reach * np.median(np.diff(ts))
+    late = (ts[index] - ts[:, None]) / width
+    # Beyond a gap the body may have turned by any angle.
+    taken = exists & (np.abs(late) < 1.5)
+    known = np.sum(taken, axis=1) > _CLOSE
+    turn = log(multiply(conjugate(attitude)[:, None], attitude[index]))
+    # Not held at zero where the parabola begins: that sample is as noisy as others.
+    powers = np.stack([np.ones_like(late), late, late**2], axis=-1)
+    powers = np.where(taken[..., None], powers, 0.0)
+    normal = np.swapaxes(powers, 1, 2) @ powers
+    normal = np.where(known[:, None, None], normal, np.eye(3))
+    parabolas = np.linalg.solve(normal, np.swapaxes(powers, 1, 2) @ turn)
+    return parabolas[:, 1] / width, known[:, None]
 
 
 def _turns(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:

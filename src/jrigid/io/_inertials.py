@@ -86,8 +86,17 @@ class _Stated(NamedTuple):
     options: Mapping[str, str]
 
 
+def _refuse_twins(inertial: ET.Element) -> None:
+    """Raise ValueError where an element of an inertial is stated twice."""
+    # Comments have a function in place of a tag.
+    tags = [x.tag for x in inertial.iter() if isinstance(x.tag, str)]
+    twins = sorted({x for x in tags if tags.count(x) > 1})
+    demand(not twins, f"it has {', '.join(f'two <{x}>' for x in twins)}.")
+
+
 def _urdf(inertial: ET.Element, _: ET.Element) -> _Stated:
     """An inertial of URDF. Source: wiki.ros.org/urdf/XML/link."""
+    _refuse_twins(inertial)
     known = {f"{x.tag} {k}": text for x in inertial for k, text in x.attrib.items()}
     mass, *six = _texts(known, "mass value", *(f"inertia {k}" for k in _SIX))
     attributes = {
@@ -103,6 +112,7 @@ def _sdf(inertial: ET.Element, _: ET.Element) -> _Stated:
     """An inertial of SDF. Source: SDFormat 1.12, inertial."""
     is_automatic = _flag(inertial.attrib, "auto")
     demand(not is_automatic, "`auto` is for the simulator to compute.")
+    _refuse_twins(inertial)
     known = {x.tag: _text_of(x) for x in inertial.iter()}
     about = getattr(inertial.find("pose"), "attrib", {})
     position, turn, options = _sdf_pose(known.get("pose", ""), about)
@@ -145,6 +155,8 @@ def _mjcf(inertial: ET.Element, root: ET.Element) -> _Stated:
     options: dict[str, str] = {}
     for compiler in root.iter("compiler"):  # the last one wins
         options |= compiler.attrib
+    is_global = options.get("coordinate") == "global"
+    demand(not is_global, "global coordinates, which MuJoCo no longer takes.")
     from_shapes = options.get("inertiafromgeom") == "true"
     demand(not from_shapes, "`inertiafromgeom` makes MuJoCo overlook it.")
     for name in _MASS_OPTIONS:
@@ -397,6 +409,16 @@ def _check_body(name: str, body: object) -> None:
     demand(are_finite, f"Argument `{name}` must be finite, but it is not.")
 
 
+def _refuse_other_format(path: str | Path, root: ET.Element) -> None:
+    """Raise ValueError where the suffix of a file promises another format."""
+    kind = {".urdf": "robot", ".sdf": "sdf"}.get(Path(path).suffix, root.tag)
+    demand(
+        kind == root.tag,
+        f"Argument `path` must have the suffix of its format, but {Path(path).name!r} "
+        f"would hold a template of root <{root.tag}>.",
+    )
+
+
 def write_inertials(
     path: str | Path,
     bodies: Mapping[str, MassProperties],
@@ -420,9 +442,9 @@ def write_inertials(
             needs.
 
     Raises:
-        ValueError: A suffix of no format, a batch of bodies, a number that is not
-            finite, a link that the template has not, or a template that
-            `read_inertials` could not read (macros, broken XML).
+        ValueError: A suffix of no format or of another than the template's, a batch of
+            bodies, a number that is not finite, a link that the template has not, or a
+            template that `read_inertials` could not read (macros, broken XML).
 
     >>> import jrigid as jr
     >>> from tempfile import TemporaryDirectory
@@ -442,6 +464,7 @@ def write_inertials(
     source = document(template)
     root = tree_of(source)
     _refuse_made_links("template", root)
+    _refuse_other_format(path, root)
     links = _links(root)
     strange = sorted(set(bodies) - set(links))
     message = f"but {strange} are not in it."

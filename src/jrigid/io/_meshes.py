@@ -51,7 +51,8 @@ def mesh_arrays(
     # `merge_vertices` changes a mesh in place.
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
-    faces = np.asarray(merged.faces, np.int64)
+    # Of a mesh without faces trimesh gives an array of one axis.
+    faces = np.asarray(merged.faces, np.int64).reshape(-1, 3)
     # A face has collapsed where two of its corners are one vertex now.
     is_line = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
     return np.asarray(merged.vertices, float), faces[~is_line]

@@ -199,10 +199,7 @@ def _evened(
     pieces: list[np.ndarray], asked: bool, notes: list[str]
 ) -> list[np.ndarray]:
     """Put each piece on its line if asked to, or if that only undoes rounding."""
-    ticks = (np.concatenate(pieces) - pieces[0][0])[:, None] / _DIGITS
-    is_whole = np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3
-    # The coarsest digit of which all times are multiples, 0 if there is none.
-    digit = _DIGITS[is_whole].max(initial=0.0)
+    tick, shared = _tick(pieces)
     evened = list(pieces)
     beside: list[tuple[float, float]] = []
     for i, piece in enumerate(pieces):
@@ -212,18 +209,29 @@ def _evened(
             continue
         line, interval = _line(piece, asked)
         jitter = np.abs(piece - line)
-        is_uneven = np.mean(np.abs(steps - np.median(steps)) > digit / 2) > _OFTEN
-        is_coarse = digit > _COARSE * interval
-        is_rounding = jitter.max() < _ROUND * digit
+        uneven = np.mean(np.abs(steps - np.median(steps)) > tick / 2)
+        is_uneven = shared or uneven > _OFTEN
+        is_coarse = tick > _COARSE * interval
+        is_rounding = jitter.max() < _ROUND * tick
         if asked or (is_uneven and is_coarse and is_rounding):
             evened[i] = line
             beside.append((interval, float(np.sqrt(np.mean(jitter**2)))))
     if beside:
         intervals, jitters = 1e3 * np.transpose(beside)
-        why = "as asked" if asked else f"they are rounded to {1e3 * digit:g} ms"
+        why = "as asked" if asked else f"they are rounded to {1e3 * tick:.5g} ms"
         note = f"times put on an even clock of {intervals.mean():.5g} ms: {why}, "
         notes.append(f"{note}{jitters.max():.3g} ms rms beside it")
     return evened
+
+
+def _tick(pieces: list[np.ndarray]) -> tuple[float, bool]:
+    """What times are multiples of, 0 if of nothing; do most rows share their tick?"""
+    steps = np.concatenate([np.diff(x) for x in pieces])
+    if np.median(steps) == 0:
+        return float(np.median(steps[steps > 0])), True
+    ticks = (np.concatenate(pieces) - pieces[0][0])[:, None] / _DIGITS
+    is_whole = np.abs(ticks - np.round(ticks)).max(axis=0) < 1e-3
+    return float(_DIGITS[is_whole].max(initial=0.0)), False
 
 
 def _in_turn(

@@ -48,7 +48,7 @@ _KINDS = {
 _AXIS = re.compile(r"^(.*?)[\s_.\-]*(\[[012]\]|[xyz])$", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[(\[]\s*([^()\[\]\d][^()\[\]]*)\s*[)\]]\s*$")
 _SUFFIX = re.compile(
-    r"_(rad_s|deg_s|rads|degs|dps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE
+    r"_(rad_s|deg_s|rads|degs|dps|mdps|rpm|mps2|ms|us|ns|s)$", re.IGNORECASE
 )
 # Times beyond this count from some epoch [s], and are made to count from 0.
 _EPOCH = 1e6
