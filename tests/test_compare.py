@@ -80,17 +80,36 @@ def test_what_is_no_fit_is_not_compared(untyped):
 def test_each_trial_or_group_is_left_out_once():
     """By a fit that remembers what it was shown."""
 
+    class Diagnostics:
+        log_determinant = 10_000.0
+
     class Shown:
+        diagnostics = Diagnostics()
+
         def __init__(self, chi_square):
             self.chi_square = jnp.asarray(chi_square)
 
     def refit(total, group):
         return Shown(float(total) * 100 + sum(group))
 
-    squares = identify.cross_validate(sum, [1, 2, [3, 4]], refit=refit)
-    np.testing.assert_array_equal(squares, [901, 802, 307])
+    misfits = identify.cross_validate(sum, [1, 2, [3, 4]], refit=refit)
+    np.testing.assert_array_equal(misfits, [10_901, 10_802, 10_307])
     with pytest.raises(ValueError, match="two trials"):
         identify.cross_validate(sum, [1], refit=refit)
+
+
+def test_cross_validation_prefers_no_torque_where_there_is_none(rng):
+    """A large torque follows any trial, so that its chi-square alone is the least."""
+    records = trials(rng, count=3)
+
+    def misfit(level):
+        return identify.cross_validate(
+            lambda x: identify.fit(BLIND, x, unmodelled=level, throw=False), records
+        )
+
+    without = misfit(0.0)
+    assert np.all(misfit(0.1) > without + 50)
+    assert np.all(misfit(10.0) > misfit(0.1) + 50)
 
 
 @pytest.mark.slow  # programs of its own

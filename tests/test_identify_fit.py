@@ -1110,6 +1110,33 @@ def test_a_model_or_a_noise_that_is_wrong_is_said_to_be(blind_fit, trials, rng):
     assert re.search(r"residuals are [45](\.\d)? times the stated noise", str(found))
 
 
+def test_larger_residuals_do_not_loosen_what_was_known_beforehand(rng):
+    """Of a symmetric body the rates alone tell no ratio beside an unknown scale."""
+    motion = jr.free_rotation(
+        jnp.array([1.0, 1.0, 1.6]), jr.State(UNTURNED, jnp.array([1.0, 0.5, 2.0])), TS
+    )
+    omegas = np.asarray(motion.omega) + 0.01 * rng.normal(size=(TS.size, 3))
+
+    def found(sigma):
+        return identify.fit(
+            BLIND,
+            identify.Rates(TS, omegas, sigma),
+            free=lambda _, gyro: identify.prior(gyro.scale, 0.01),
+            inertia_model=identify.Top(),
+            throw=False,
+        )
+
+    right = found(0.01)
+    wrong = found(0.002)
+    assert bool(wrong.status == Status.MISFIT)
+    np.testing.assert_allclose(right.estimates["gyro.scale"][1], 0.01, rtol=0.01)
+    np.testing.assert_allclose(wrong.estimates["gyro.scale"][1], 0.01, rtol=0.01)
+    np.testing.assert_allclose(wrong.ratios_errors, right.ratios_errors, rtol=0.1)
+    # That advice would be refused, see the next test.
+    assert "`sigma` is too small" in str(wrong)
+    assert "absolute_sigma" not in str(wrong)
+
+
 def test_what_cannot_be_weighed_is_refused():
     _, omegas, _ = rates(ASYMMETRIC)
     relative = {"absolute_sigma": False}

@@ -201,7 +201,7 @@ def _fit_of_states(result: FitResult, trials: list[Any]) -> FitResult:
         unmodelled=GaussMarkov(level, result.correlation_time),
         loss="robust" if options.robust else "squares",
         motion=options.motion,
-        # A trial that the others do not describe is no error: its chi-square is what is
+        # A trial that the others do not describe is no error: its misfit is what is
         # asked for.
         throw=False,
     )
@@ -213,12 +213,15 @@ def cross_validate(
     *,
     refit: Callable[[FitResult, list[Any]], FitResult] = _fit_of_states,
 ) -> Float[Array, " trials"]:
-    """Return chi-square of each trial, as predicted by a fit of the other trials.
+    """Return the misfit of each trial, as predicted by a fit of the other trials.
 
     A fit of the other trials gives the body, its torque and the sensors. Of the trial
     that is left out only the state is sought. Compare models trial by trial: the
     differences and their scatter show which model predicts better, without a count of
     unknowns.
+
+    The misfit is -2 log of the likelihood, up to a constant: chi-square, plus the
+    logarithm of a determinant where there is an unmodelled torque (see `compare`).
 
     Args:
         fit_function: Fits a list of trials, such as
@@ -234,7 +237,7 @@ def cross_validate(
             observed.
 
     Returns:
-        Chi-square of each trial or group.
+        Misfit of each trial or group; without an unmodelled torque its chi-square.
 
     Raises:
         ValueError: There is only one trial or group, or the noise is not stated.
@@ -258,8 +261,10 @@ def cross_validate(
         "Argument `trials` must hold two trials or groups at least, but it holds "
         f"{len(groups)}.",
     )
-    squares = []
+    misfits = []
     for i, group in enumerate(groups):
         others = [*chain(*groups[:i], *groups[i + 1 :])]
-        squares.append(refit(fit_function(others), group).chi_square)
-    return jnp.stack(squares)
+        result = refit(fit_function(others), group)
+        # Without the determinant the largest torque would be the best model.
+        misfits.append(result.chi_square + result.diagnostics.log_determinant)
+    return jnp.stack(misfits)

@@ -627,6 +627,10 @@ def _inflated(
     """The covariance of the numbers, with errors as large as the fit shows them."""
     units = fit.minimum.units
     factors = np.maximum(scatter, 1.0)
+    if fit.problem.priors(len(fit.kept)) and not fit.problem.options.dense:
+        # Larger residuals say nothing of what was known beforehand.
+        known = precision(_with_noisier_sensors(fit, inflation))
+        inflation = 1.0
     covariance = inflation * _with_larger_errors(known, factors, units)
     covariance = covariance + inflation * added_by_torque(fit)
     if fit.probes:
@@ -634,6 +638,14 @@ def _inflated(
         probed = max(x.error for x in fit.probes)
         covariance = _with_error(judged, covariance, units, probed)
     return covariance
+
+
+def _with_noisier_sensors(fit: Fit, factor: float) -> Fit:
+    """The fit with sensors of so many times the variance, and priors as stated."""
+    samples = fit.kept.shape[1]
+    weight = np.array(fit.minimum.weight)
+    weight[:, :samples] /= factor
+    return dataclasses.replace(fit, minimum=fit.minimum._replace(weight=weight))
 
 
 def _status_of_misfit(fit: Fit, unexplained: float) -> str:

@@ -263,7 +263,11 @@ def _of_noise(result: FitResult) -> str:
             "Trials differ by more than their errors say: they may be of different "
             "bodies."
         )
+    otherwise = ", or `absolute_sigma=False`"
+    if result.problem.priors(len(result.kept)):
+        # A noise that is only relative cannot be weighed against what is known.
+        otherwise = ""
     return (
-        f"{residuals}, and white: `sigma` is too small. Pass the noise of the sensor, "
-        "or `absolute_sigma=False`."
+        f"{residuals}, and white: `sigma` is too small. Pass the noise of the sensor"
+        f"{otherwise}."
     )

@@ -25,8 +25,11 @@ class LogDensity(NamedTuple):
     """A posterior density, and where and how to sample it.
 
     A position holds the numbers of the fit. After them follow, for each trial, the
-    change of its state from that of the fit and the trial's own numbers. This is the
-    order of `covariance`.
+    change of its first state from that of the fit and the trial's own numbers. This is
+    the order of `covariance`. The change of a state is that of its angular velocity
+    (3,) in body axes [rad/s]. Where something depends on the attitude, a rotation
+    vector (3,) about body axes follows [rad], by which the body turns from the attitude
+    of the fit.
 
     Attributes:
         function: Logarithm of the density at a position, up to a constant.
@@ -100,7 +103,9 @@ def log_density(result: FitResult) -> LogDensity:
 
     The density contains the logarithms of the Jacobians that belong to the numbers. The
     posterior has two modes where the record fits two bodies, or a body and its mirror
-    image. A sampler that starts at a fit stays in the mode of that fit.
+    image. A sampler that starts at a fit stays in the mode of that fit. Where the
+    residuals are larger than the stated noise, the noise is taken to be as large as
+    they are, and priors are as stated.
 
     Args:
         result: A single fit without an unmodelled torque. If no noise was stated, its
@@ -109,7 +114,8 @@ def log_density(result: FitResult) -> LogDensity:
     Raises:
         ValueError: The fit has an unmodelled torque.
 
-    Gradients: in every mode; in reverse mode under a torque.
+    Gradients: first derivatives in every mode, under a torque in reverse mode; second
+    ones without a torque, where the three moments differ.
 
     >>> import jax, jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
@@ -137,7 +143,8 @@ def log_density(result: FitResult) -> LogDensity:
     # Priors stand in rows after the samples. Rows that hold a fit near its start while
     # little of the record takes part are left out.
     priors = problem.known - problem.held
-    samples = jnp.where(result.kept, 1.0, 0.0)
+    # An inflation above 1 means noise as large as the residuals, not as stated.
+    samples = jnp.where(result.kept, 1.0, 0.0) / result.diagnostics.inflation
     weight = jnp.pad(samples, ((0, 0), (0, priors)), constant_values=1.0)
 
     def function(position: Array) -> Array:
@@ -146,10 +153,8 @@ def log_density(result: FitResult) -> LogDensity:
         own = of_trials[:, state_size:]
         point = Point(numbers, own, attitude, omega, no_torque)
         rows = rows_at_position(point, of_trials[:, None, :state_size])
-        # An inflation above 1 means noise as large as the residuals, not as stated.
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
-        likelihood = -0.5 * chi_square / result.diagnostics.inflation
-        return likelihood + _log_jacobian(unknowns, numbers, own)
+        return -0.5 * chi_square + _log_jacobian(unknowns, numbers, own)
 
     no_change = jnp.zeros((trials, state_size), result.numbers.dtype)
     of_trials = jnp.concatenate([no_change, result.own_numbers], axis=1).reshape(-1)
