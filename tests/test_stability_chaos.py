@@ -143,6 +143,15 @@ def test_integrable_bodies_are_regular_and_their_exponents_vanish_like_log_t_ove
     assert 1.5 < float(indicator.megno) < 2.2
 
 
+@pytest.mark.parametrize("every", [10, 100, 5000])
+def test_a_megno_does_not_depend_on_how_often_growth_is_measured(every):
+    """Of one measurement it would be 10, and of five 4.4."""
+    body, start = jr.RigidBody(MOMENTS), state([0.0, 0.0, 0.0], [0.5, 0.3, 0.8])
+    found = st.megno(body, start, 1000.0, 5000, every=every, samples=1)
+    assert 1.7 < float(found.megno) < 2.2
+    assert st.ORDER[found.order] == "regular"
+
+
 def test_exponents_without_damping_pair_to_zero():
     _, found = spectrum_of_heavy(32, 6)
     mean = np.asarray(found.exponents).mean(axis=0)
@@ -373,6 +382,14 @@ def test_crossings_in_either_direction_and_those_there_are_not():
     )
     assert not none.valid.any()
     assert np.isnan(none.ts).all()
+
+
+def test_a_condition_that_is_no_floating_point_number_is_refused():
+    """A boolean has no zero at which a crossing could be located."""
+    body, start = jr.RigidBody(MOMENTS), state([0.0, 0.0, 0.0], [-0.5, 0.3, 0.8])
+    for condition in (lambda _, s: s.omega[0] > 0, lambda _, s: jnp.int32(s.omega[0])):
+        with pytest.raises(ValueError, match="must return a floating point number"):
+            st.poincare_section(body, start, condition, 3, 0.1)
 
 
 def test_sections_of_many_lanes_and_of_starts_on_the_surface():

@@ -35,6 +35,9 @@ from jrigid.systems import RigidBody
 # In the limit a regular motion has 2, and a chaotic one grows without bound.
 _REGULAR = 3.0
 _CHAOTIC = 5.0
+# The fewest measurements of growth of a MEGNO. With so many a regular motion is within
+# a tenth of 2; with ten it would have 4.
+_FEWEST = 100
 # A small motion is independent of those before it if its part orthogonal to them has a
 # length of this many eps.
 _INDEPENDENT = 1e3
@@ -112,13 +115,20 @@ class _Schedule(NamedTuple):
         return self.samples * self.intervals * self.steps
 
 
-def _schedule(steps: int, every: int, samples: int) -> _Schedule:
-    """Divide the steps into samples of one length, rounding their number up."""
+def _schedule(steps: int, every: int, samples: int, fewest: int = 1) -> _Schedule:
+    """Divide the steps into samples of one length, rounding their number up.
+
+    Args:
+        steps: Number of steps.
+        every: Number of steps of an interval.
+        samples: Number of samples.
+        fewest: The fewest intervals; they are shorter where there would be fewer.
+    """
     steps = whole_number("steps", steps)
     every = whole_number("every", every)
     samples = min(whole_number("samples", samples), steps)
     # An interval is not longer than a sample.
-    every = min(every, -(-steps // samples))
+    every = min(every, -(-steps // max(samples, fewest)))
     # The duration is kept, so more steps are shorter ones, and no result is less
     # accurate than was asked for.
     return _Schedule(samples, -(-steps // (samples * every)), every)
@@ -351,7 +361,9 @@ def megno(
         args: Passed to the torque.
         t0: Time at the start [s].
         vector: The small motion to start from, as for `lyapunov_spectrum`.
-        every: Number of steps between two measurements of its growth.
+        every: Number of steps between two measurements of its growth; fewer where there
+            would be less than 100 measurements, since their mean tends to 2 only if
+            there are many.
         samples: Number of times in `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
         throw: With False, a bad or an inaccurate lane gives a result code and NaN.
@@ -377,5 +389,5 @@ def megno(
     motion = motion_of(system, state0, args, t0, duration, solver)
     if vector is not None:
         vector = array_of_shape("vector", vector, motion.dimension)[None]
-    schedule = _schedule(steps, every, samples)
+    schedule = _schedule(steps, every, samples, _FEWEST)
     return _settled_indicators(motion, schedule, vector, 1, throw).megno

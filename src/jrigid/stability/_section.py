@@ -15,6 +15,7 @@ from jrigid._checks import (
     Findings,
     check_option,
     check_shape,
+    demand,
     nan_where,
     settle,
     traced_by_jax,
@@ -94,6 +95,7 @@ def poincare_section(
         States and times of the crossings. A start on the surface is no crossing.
 
     Raises:
+        ValueError: The condition returns no floating point number, such as a boolean.
         RuntimeError: A value is bad, or the step is too coarse. It is no error if there
             are fewer crossings than requested: see `valid`.
 
@@ -122,8 +124,13 @@ def _section_findings(motion: Motion, condition: Condition) -> Findings:
     """What is wrong with the arguments of a section."""
     findings = findings_of(motion)
     with traced_by_jax("a condition"):
-        value = jnp.asarray(condition(motion.t0, motion.state0), motion.t0.dtype)
+        value = jnp.asarray(condition(motion.t0, motion.state0))
     check_shape("condition", value, ())
+    demand(
+        jnp.issubdtype(value.dtype, jnp.floating),
+        "Argument `condition` must return a floating point number that is zero on the "
+        f"surface and changes its sign there, but it returns {value.dtype}.",
+    )
     message = "Argument `condition` must be finite at the start, but it is not."
     findings.require(jnp.isfinite(value), RESULTS.invalid_vector_field, message, value)
     return findings
