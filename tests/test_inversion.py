@@ -269,12 +269,18 @@ def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
         )
         numbers = numbers_of(tumbler, data, epoch)[None]
         found = search._minimised(data, numbers, task, search._LAST_STEPS)
+        found, mirror = search.beside_mirror(data, found)
         scale = found.quadratic.chi_square[0] / 360
         assert 0.7 < scale < 1.3
         best = alias.alias_of(
-            found.numbers[0], model.Task(*(x[0] for x in task)), data, scale
+            found.numbers[0], model.Task(*(x[0] for x in found.tasks)), data, scale
         )
-        return best, _inversion._mirror(best, found, data, scale, 25.0)
+        # A search that went to the mirror comes back to the better of the two.
+        back, other = search.beside_mirror(data, mirror)
+        least = min(x.quadratic.chi_square[0] for x in (found, mirror))
+        assert back.quadratic.chi_square[0] <= least + 1e-6
+        assert other.quadratic.chi_square[0] >= back.quadratic.chi_square[0]
+        return best, _inversion._alias_apart(best, mirror, data, scale, 25.0)
 
     best, mirror = tumbler_and_mirror(0.0)
     assert abs(mirror.chi_square - best.chi_square) < 1e-6

@@ -35,6 +35,7 @@ OPTIONS = (
     (r"`longest`", "`--longest`"),
     (r"`noise`", "`--noise`"),
     (r"`pairs`", "`--pairs`"),
+    (r"`inertia='free'`", "`--inertia free`"),
     (r"`time_scale`", "`--time-scale`"),
     (r": pass positions of your own for an open orbit", ""),
     (

@@ -33,7 +33,7 @@ from jrigid.photometry._readings import (
     readings_of,
     stated_noise,
 )
-from jrigid.photometry._search import Found, mirrored, search
+from jrigid.photometry._search import Found, beside_mirror, search
 
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.
@@ -75,6 +75,8 @@ class Inversion:
         span: Time from the first epoch to the last [s].
         is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
             holds what the model misses.
+        is_homogeneous: Whether the moments were taken to be those of a homogeneous
+            ellipsoid.
     """
 
     aliases: list[Alias]
@@ -88,6 +90,7 @@ class Inversion:
     determined: bool
     span: float
     is_noise_found: bool = False
+    is_homogeneous: bool = True
     mirror: Alias | None = None
 
     def report(self) -> str:
@@ -221,7 +224,8 @@ def find_tumblers(
         pairs,
     )
     width = highest - lowest
-    return _inversion(found, readings, epoch, curves, stated, threshold, width)
+    inversion = _inversion(found, readings, epoch, curves, stated, threshold, width)
+    return dataclasses.replace(inversion, is_homogeneous=inertia == "homogeneous")
 
 
 def _inversion(
@@ -244,6 +248,7 @@ def _inversion(
         threshold: Largest growth of chi-square of an alias.
         width: Of the range of frequencies that were searched [cycles].
     """
+    found, mirror = beside_mirror(readings, found)
     tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
     unknown = readings.factor_count() + int(np.count_nonzero(independent(tasks[0])))
     freedom = points_of(curves) - unknown
@@ -279,7 +284,7 @@ def _inversion(
         determined=near == 1 and is_followed,
         span=float(readings.span),
         is_noise_found=not stated,
-        mirror=_mirror(every[0], found, readings, scale, threshold),
+        mirror=_alias_apart(every[0], mirror, readings, scale, threshold),
     )
 
 
@@ -305,32 +310,31 @@ def _weighted(
     ]
 
 
-def _mirror(
-    best: Alias, found: Found, readings: Readings, scale: float, threshold: float
+def _alias_apart(
+    best: Alias, mirror: Found, readings: Readings, scale: float, threshold: float
 ) -> Alias | None:
     """The best tumbler's mirror, where it explains the light curves as well.
 
     Args:
         best: The best tumbler.
-        found: What the search found.
+        mirror: Its mirror, if there is one.
         readings: The light curves.
         scale: Chi-square of the best tumbler over its degrees of freedom.
         threshold: Largest growth of chi-square of an alias.
     """
-    other = mirrored(readings, found)
-    if not len(other.numbers):
+    if not len(mirror.numbers):
         return None
-    growth = other.quadratic.chi_square[0] - found.quadratic.chi_square[0]
+    growth = mirror.quadratic.chi_square[0] - best.chi_square
     if growth > threshold * scale:
         return None
-    task = Task(*(x[0] for x in other.tasks))
-    mirror = alias_of(other.numbers[0], task, readings, scale)
+    task = Task(*(x[0] for x in mirror.tasks))
+    other = alias_of(mirror.numbers[0], task, readings, scale)
     poles = [
         direction_of_pole(x.longitude, x.latitude)
-        for x in (best.estimates, mirror.estimates)
+        for x in (best.estimates, other.estimates)
     ]
     is_apart = poles[0] @ poles[1] < np.cos(_ONE_POLE)
-    return mirror if is_apart else None
+    return other if is_apart else None
 
 
 def report_of(inversion: Inversion) -> str:
@@ -354,6 +358,12 @@ def report_of(inversion: Inversion) -> str:
         lines += [
             "",
             f"The next tumbler has a chi-square that is larger by {grown:.0f}.",
+        ]
+    if inversion.is_homogeneous:
+        lines += [
+            "",
+            "Values and errors hold for homogeneous ellipsoids. `inertia='free'` seeks "
+            "the moments apart from the shape.",
         ]
     return "\n".join(lines)
 

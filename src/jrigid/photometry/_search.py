@@ -113,7 +113,21 @@ def search(
     return _settled(readings, _joined(found), homogeneous)
 
 
-def mirrored(readings: Readings, found: Found) -> Found:
+def beside_mirror(readings: Readings, found: Found) -> tuple[Found, Found]:
+    """The points with the better of the best one and its mirror first, and the other.
+
+    There may be no other.
+    """
+    mirror = _mirrored(readings, found)
+    if not len(mirror.numbers):
+        return found, mirror
+    if mirror.quadratic.chi_square[0] >= found.quadratic.chi_square[0]:
+        return found, mirror
+    others = np.arange(1, len(found.numbers))
+    return _joined([mirror, _chosen(found, others)]), _chosen(found, [0])
+
+
+def _mirrored(readings: Readings, found: Found) -> Found:
     """The best point, mirrored by the plane from which the body was seen, and refined.
 
     Let M reflect vectors at that plane. Directions in the plane stay as they are, and

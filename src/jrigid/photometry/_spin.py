@@ -502,7 +502,8 @@ def _verdict(found: SpinInversion) -> str:
             "No steady rotation was found that follows the light curves to their noise: "
             f"{value}, and what is left at neighbouring points correlates by "
             f"{found.correlation:.2f}. The body tumbles or is far from convex, its "
-            "period is out of the range, or a stated noise is too small."
+            "period is out of the range, `scattering` is another law, `degree` or "
+            "`facets` are too few, or a stated noise is too small."
         )
     if count == 1:
         return f"One steady rotation explains the light curves: {value}."
