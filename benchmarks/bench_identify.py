@@ -418,23 +418,27 @@ def peers(turns, count):
         return jr.RigidBody(3 * body / jnp.trace(body)), jr.State(UNTURNED, x[5:])
 
     @jax.jit
-    def rows_of(x, y):
-        body, state = unpacked(x)
+    def rows_of(motion, y):
+        body, state = motion
         return residuals(body, state, Rates(ts, y, 0.01)).reshape(-1)
+
+    @jax.jit
+    def rows_at(x, y):
+        return rows_of(unpacked(x), y)
 
     def by_scipy(y):
         start = np.concatenate([np.zeros(5), y[0]])
         found = scipy.optimize.least_squares(
-            lambda x: np.asarray(rows_of(x, y)), start, method="lm", max_nfev=2000
+            lambda x: np.asarray(rows_at(x, y)), start, method="lm", max_nfev=2000
         )
-        return found.x
+        return unpacked(found.x)
 
     optimiser = optax.adam(optax.cosine_decay_schedule(0.02, 1500))
 
     @jax.jit
     def by_adam(y):
         def loss(x):
-            return jnp.mean(rows_of(x, y) ** 2)
+            return jnp.mean(rows_at(x, y) ** 2)
 
         def step(carry, _):
             x, state = carry
@@ -442,11 +446,12 @@ def peers(turns, count):
             return (optax.apply_updates(x, updates), state), None
 
         x = jnp.concatenate([jnp.zeros(5), y[0]])
-        return jax.lax.scan(step, (x, optimiser.init(x)), None, length=1500)[0][0]
+        carry = (x, optimiser.init(x))
+        return unpacked(jax.lax.scan(step, carry, None, length=1500)[0][0])
 
     def by_fit(y):
         found = fit(SPHERE, Rates(ts, y, 0.01), throw=False)
-        return jnp.concatenate([found.numbers, found.state.omega[0]])
+        return found.system, jr.State(UNTURNED, found.state.omega[0])
 
     rows = []
     true = np.asarray(of_elements(tensor))
@@ -456,15 +461,15 @@ def peers(turns, count):
     for name, method in methods.items():
         jax.block_until_ready(method(records[0]))
         start = time.perf_counter()
-        answers = [np.asarray(jax.block_until_ready(method(y))) for y in records]
+        answers = [jax.block_until_ready(method(y)) for y in records]
         each = (time.perf_counter() - start) * 1e3 / count
         chi = [
-            np.mean(np.asarray(rows_of(x, y)) ** 2)
-            for x, y in zip(answers, records, strict=True)
+            np.mean(np.asarray(rows_of(motion, y)) ** 2)
+            for motion, y in zip(answers, records, strict=True)
         ]
         errors = [
-            np.abs(np.asarray(of_elements(unpacked(x)[0].inertia)) - true).max()
-            for x in answers
+            np.abs(np.asarray(of_elements(body.inertia)) - true).max()
+            for body, _ in answers
         ]
         success = np.array(chi) < gate
         rows.append(
