@@ -439,6 +439,21 @@ def test_rates_from_attitudes_however_close_they_are(rng, step, sigma, bar):
     assert np.quantile(off[seen], 0.95) < bar
 
 
+def test_rates_of_a_body_that_swings_by_small_angles(rng):
+    """It never turns far, but its rate changes its sign within some samples."""
+    ts = np.arange(0.0, 60.0, 0.05)
+    swing = np.outer(0.1 * np.sin(2 * ts), [1.0, 0.0, 0.0])
+    rates = np.outer(0.2 * np.cos(2 * ts), [1.0, 0.0, 0.0])
+    noise = Rotation.from_rotvec(1e-3 * rng.normal(size=(ts.size, 3)))
+    attitudes = (Rotation.from_rotvec(swing) * noise).as_quat(scalar_first=True)
+    records = of_trials(identify.Attitudes(ts, attitudes, 1e-3))
+    records = jax.tree.map(np.asarray, records)
+    readings = direct_readings_of(records, samples_of(records, np.ones(())), None)
+    # Rates between neighbours would be off by .02 rad/s.
+    off = np.linalg.norm(readings.omega[0] - rates, axis=1)
+    assert np.sqrt(np.mean(off**2)) < 0.013
+
+
 def test_a_fit_of_attitudes_a_millisecond_apart(rng):
     record, _ = noisy_attitudes(
         rng, np.arange(0.0, 3.0, 1e-3), [1.0, 1.5, 2.0], [2.0, 4.0, 1.0], 5e-3

@@ -20,10 +20,13 @@ _UNEVEN = 0.1
 # Radians from one attitude to the next, twelve samples a turn.
 _SMALL_TURN = 0.5
 # Rates are taken from the attitudes within a turn that is so little [rad] ...
-_LITTLE = 0.25
+_LITTLE = 1.0
 _NEARLY_ALWAYS = 0.95
-# ... where there are so many of them on each side.
+# ... where there are so many of them on each side ...
 _CLOSE = 8
+# ... and parabolas leave no more than so many times what noise does.
+_WORSE = 1.2
+_FEW = 256  # parabolas that decide
 
 
 class DirectReadings(NamedTuple):
@@ -110,55 +113,74 @@ def _rates_from_attitudes(
     rates = (left + right) / np.where(has_left & has_right, 2, 1).astype(ts.dtype)
     # Noise hides the turns between samples that follow each other closely.
     place = np.flatnonzero(valid)
-    reach = _reach(attitude[place])
-    if reach >= _CLOSE:
-        slopes, known = _slopes(ts[place], attitude[place], reach)
+    reach = _reach(ts[place], attitude[place])
+    if reach:
+        slopes, known, _ = _slopes(
+            ts[place], attitude[place], np.arange(place.size), reach
+        )
         rates[place] = np.where(known, slopes, rates[place])
     return rates
 
 
-def _reach(attitude: np.ndarray) -> int:
-    """The most samples, a power of two, that the body nearly always turns little in."""
-    reach = 1
-    while 2 * reach < len(attitude):
+def _reach(ts: np.ndarray, attitude: np.ndarray) -> int:
+    """How many samples to each side tell a rate best; 0 where neighbours do.
+
+    The turns to them must be small and follow a parabola as well as those to the
+    nearest samples do, whose residuals are noise.
+    """
+    best = 0
+    least = np.inf
+    reach = _CLOSE
+    some = np.arange(0, ts.size, max(1, ts.size // _FEW))
+    while 2 * reach < ts.size:
         turn = log(multiply(conjugate(attitude[: -2 * reach]), attitude[2 * reach :]))
         if np.quantile(np.linalg.norm(turn, axis=1), _NEARLY_ALWAYS) > _LITTLE:
             break
+        _, _, residual = _slopes(ts, attitude, some, reach)
+        if residual > _WORSE * least:
+            break
+        best = reach
+        least = min(least, residual)
         reach *= 2
-    return reach
+    return best
 
 
 def _slopes(
-    ts: np.ndarray, attitude: np.ndarray, reach: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rates (n, 3) from parabolas through the turns to samples nearby.
+    ts: np.ndarray, attitude: np.ndarray, at: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rates from parabolas through the turns to samples nearby.
 
     Args:
         ts: Times.
         attitude: At these times.
+        at: Indices of the samples whose rates are sought (n,).
         reach: How many samples before and after take part, or every second, fourth
             and so on of them.
 
     Returns:
-        The rates, and where there are enough samples for one (n, 1).
+        The rates (n, 3), where there are enough samples for one (n, 1), and what the
+        parabolas leave of the turns, rms.
     """
-    offsets = np.arange(-reach, reach + 1, max(1, reach // _CLOSE))
-    index = np.arange(ts.size)[:, None] + offsets
+    offsets = np.arange(-reach, reach + 1, reach // _CLOSE)
+    index = at[:, None] + offsets
     exists = (index >= 0) & (index < ts.size)
     index = np.clip(index, 0, ts.size - 1)
     width = reach * np.median(np.diff(ts))
-    late = (ts[index] - ts[:, None]) / width
+    late = (ts[index] - ts[at, None]) / width
     # Beyond a gap the body may have turned by any angle.
     taken = exists & (np.abs(late) < 1.5)
     known = np.sum(taken, axis=1) > _CLOSE
-    turn = log(multiply(conjugate(attitude)[:, None], attitude[index]))
+    taken = taken & known[:, None]
+    turn = log(multiply(conjugate(attitude[at])[:, None], attitude[index]))
     # Not held at zero where the parabola begins: that sample is as noisy as others.
     powers = np.stack([np.ones_like(late), late, late**2], axis=-1)
     powers = np.where(taken[..., None], powers, 0.0)
     normal = np.swapaxes(powers, 1, 2) @ powers
     normal = np.where(known[:, None, None], normal, np.eye(3))
     parabolas = np.linalg.solve(normal, np.swapaxes(powers, 1, 2) @ turn)
-    return parabolas[:, 1] / width, known[:, None]
+    rest = np.where(taken[..., None], turn - powers @ parabolas, 0.0)
+    residual = np.sqrt(np.sum(rest**2) / max(np.sum(taken), 1))
+    return parabolas[:, 1] / width, known[:, None], float(residual)
 
 
 def _turns(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
