@@ -61,7 +61,7 @@ from jrigid.photometry._spin import (
     freedom,
     of_surface,
 )
-from jrigid.photometry._spin_search import frame_of_pole, minimised
+from jrigid.photometry._spin_search import SEARCHED_FACETS, frame_of_pole, minimised
 from jrigid.photometry._tumbler import Tumbler
 from jrigid.photometry._tumbling import tumbling
 
@@ -170,7 +170,7 @@ def fit_shape(
     *,
     epoch: float,
     degree: int = 4,
-    facets: int = 256,
+    facets: int = 2048,
     scattering: Mixture | None = None,
     fitted: Sequence[str] = (),
     albedo: bool = False,
@@ -193,7 +193,8 @@ def fit_shape(
             all have them. Else it is what the fit leaves, and a misfit cannot be seen.
         epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
         degree: Largest degree of the harmonics of the areas.
-        facets: Number of facets.
+        facets: Number of facets. The search uses 512 of them at most, the result has
+            all. With too few the stated errors are too small.
         scattering: The law, or where its fit starts; `Mixture()` where it is None.
         fitted: Names of parameters of `scattering` that are fitted: "lambert",
             "amplitude", "width", "slope". All but the first need curves that are not
@@ -239,14 +240,17 @@ def fit_shape(
     )
     check_curves(curves, noise, fitted)
     check_options(degree, facets, law, fitted, closure)
-    surface = surface_of(_SOUGHT, degree, facets, law, tuple(fitted), albedo, closure)
+    options = (law, tuple(fitted), albedo, closure)
+    surface = surface_of(_SOUGHT, degree, facets, *options)
+    searched = surface_of(_SOUGHT, degree, min(facets, SEARCHED_FACETS), *options)
     known = stated_noise(curves, noise)
     readings, middle = readings_of(curves, FIRST_NOISE if known is None else known)
     free = freedom(readings, surface)
     later = (middle - epoch) * _DAY
     task = _task(tumbler)
     start = _start(tumbler, surface, later, float(readings.span))
-    vector, quadratic = _minimum(start, task, surface, readings)
+    vector, _ = _minimum(start, task, searched, readings)
+    vector, quadratic = _minimum(vector, task, surface, readings)
     if known is None:
         residuals = np.asarray(_residuals(vector, task, surface, readings))
         found = FIRST_NOISE * np.sqrt(np.sum(np.square(residuals)) / free)

@@ -45,6 +45,7 @@ from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin_search import (
     COARSE_DEGREE,
     COARSE_FACETS,
+    SEARCHED_FACETS,
     STRIDE,
     Spins,
     search_spins,
@@ -160,7 +161,7 @@ def find_spin(
     shortest: float,
     longest: float,
     degree: int = 6,
-    facets: int = 512,
+    facets: int = 2048,
     scattering: Mixture | None = None,
     fitted: Sequence[str] = (),
     albedo: bool = False,
@@ -187,7 +188,8 @@ def find_spin(
         longest: Longest sidereal period [s]. The cost grows with the number of periods,
             2.5 times the span of the curves over `shortest` less that over `longest`.
         degree: Largest degree of the harmonics.
-        facets: Number of facets.
+        facets: Number of facets. The search uses 512 of them at most, the solutions
+            have all. With too few the stated errors are too small.
         scattering: The law, or where its fit starts; `Mixture()` where it is None.
         fitted: Names of parameters of `scattering` that are fitted: "lambert",
             "amplitude", "width", "slope". All but the first need curves that are not
@@ -243,10 +245,11 @@ def find_spin(
         closure=closure,
     )
     surface = make(degree=degree, facets=facets)
+    searched = make(degree=degree, facets=min(facets, SEARCHED_FACETS))
     coarse = make(degree=min(degree, COARSE_DEGREE), facets=min(facets, COARSE_FACETS))
     # This refuses curves with too few points before the search.
     free = freedom(readings, surface)
-    spins = search_spins(readings, surface, coarse, *turns)
+    spins = search_spins(readings, surface, searched, coarse, *turns)
     if known is None:
         square = np.sum(_left(spins, surface, readings) ** 2)
         noise_found = FIRST_NOISE * np.sqrt(square / free)

@@ -35,6 +35,10 @@ _POLES = 24
 # The scan uses a coarse body and a part of the epochs.
 COARSE_DEGREE = 3
 COARSE_FACETS = 128
+# A facet has a kink where it becomes lit or visible. Few facets make chi-square rough,
+# with minima some degrees apart and slopes in the pole that are too large. A search may
+# be rough, but errors need more facets.
+SEARCHED_FACETS = 512
 _EPOCHS = 512
 # A body that is nearly round says little of its pole, so the shape goes first.
 _SHAPE_STEPS = 3
@@ -103,6 +107,7 @@ def frame_of_pole(pole: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def search_spins(
     readings: Readings,
     surface: Surface,
+    searched: Surface,
     coarse: Surface,
     lowest: float,
     highest: float,
@@ -112,6 +117,7 @@ def search_spins(
     Args:
         readings: The light curves.
         surface: The body that is sought.
+        searched: The same, with fewer facets.
         coarse: The body of the scan, with fewer harmonics and facets.
         lowest: Fewest turns within the span.
         highest: Most turns.
@@ -128,7 +134,7 @@ def search_spins(
     )
     finalists = best(better, _FINALISTS)
     numbers = _lifted(finalists.numbers, surface)
-    full = minimise(numbers, finalists.frames, surface, readings, _FULL_STEPS, _LANES)
+    full = minimise(numbers, finalists.frames, searched, readings, _FULL_STEPS, _LANES)
     full = best(full, _BEST)
     return settled(full, surface, readings)
 
