@@ -6,7 +6,7 @@ FOLDER is a copy of https://github.com/mkretlow/DAMIT-convex (CC-BY-4.0) with th
 programs of its folders `convexinv`, `fortran` and `lcgenerator` built there. Its test
 asteroid is (43) Ariadne: 37 relative light curves of 1,541 points. Both programs search
 the same range of periods with harmonics to degree 6 and 512 facets, and then refine to
-the end: `period_scan` and `convexinv`, and `find_spin`.
+the end: `period_scan` and `convexinv`, and `find_spin`, whose solutions have 2048.
 
 The package makes its own model of the asteroid with `convexinv`, `minkowski` and
 `standardtri`. The brightness of that model by `light_curve` is compared with that by
