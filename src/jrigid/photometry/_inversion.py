@@ -224,8 +224,7 @@ def find_tumblers(
         pairs,
     )
     width = highest - lowest
-    inversion = _inversion(found, readings, epoch, curves, stated, threshold, width)
-    return dataclasses.replace(inversion, is_homogeneous=inertia == "homogeneous")
+    return _inversion(found, readings, epoch, curves, stated, threshold, width)
 
 
 def _inversion(
@@ -284,6 +283,7 @@ def _inversion(
         determined=near == 1 and is_followed,
         span=float(readings.span),
         is_noise_found=not stated,
+        is_homogeneous=bool(tasks[0].homogeneous),
         mirror=_alias_apart(every[0], mirror, readings, scale, threshold),
     )
 

@@ -250,7 +250,8 @@ def fit_shape(
     task = _task(tumbler)
     start = _start(tumbler, surface, later, float(readings.span))
     vector, _ = _minimum(start, task, searched, readings)
-    vector, quadratic = _minimum(vector, task, surface, readings)
+    # The numbers have found each other, so that the tightest link is enough.
+    vector, quadratic = _minimum(vector, task, surface, readings, _LINKS[-1:])
     if known is None:
         residuals = np.asarray(_residuals(vector, task, surface, readings))
         found = FIRST_NOISE * np.sqrt(np.sum(np.square(residuals)) / free)
@@ -356,14 +357,18 @@ def _residuals(
 
 
 def _minimum(
-    start: np.ndarray, task: Task, surface: Surface, readings: Readings
+    start: np.ndarray,
+    task: Task,
+    surface: Surface,
+    readings: Readings,
+    links: Sequence[float] = _LINKS,
 ) -> tuple[np.ndarray, Quadratic]:
     """The numbers of least chi-square near a start, and chi-square about them."""
     lane = jax.tree.map(lambda x: x[None], task)
     steps = np.asarray(_STEPS)
     numbers = start[None]
     quadratic = None
-    for link in _LINKS:
+    for link in links:
         linked = lane._replace(link=np.asarray([link]))
         numbers, quadratic = minimised(
             _quadratic, numbers, linked, surface, readings, steps

@@ -362,7 +362,7 @@ def megno(
         t0: Time at the start [s].
         vector: The small motion to start from, as for `lyapunov_spectrum`.
         every: Number of steps between two measurements of its growth; fewer where there
-            would be less than 100 measurements, since their mean tends to 2 only if
+            would be fewer than 100 measurements, since their mean tends to 2 only if
             there are many.
         samples: Number of times in `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
