@@ -142,6 +142,32 @@ def test_other_calls_are_as_without_it():
     assert _ratio.__wrapped__.__name__ == "_ratio"
 
 
+@pytest.mark.parametrize("function", ["growth_rate", "frequency", "modes"])
+def test_functions_of_an_axis_are_one_program_for_each_axis(programs, function):
+    function = getattr(jr.stability, function)
+    moments, spin = np.array([1.0, 2.0, 3.0]), np.asarray(1.5)
+    for axis in (0, 1, 2, 0, 1, 2):
+        by_place = function(moments, axis, spin)
+        by_name = function(moments=moments, spin=spin, axis=axis)
+        jax.tree_util.tree_map(np.testing.assert_array_equal, by_place, by_name)
+    assert programs() == 3
+    with pytest.raises(ValueError, match="`axis` must be one of 0, 1, 2"):
+        function(moments, 3, spin)
+
+
+def test_integrals_are_one_program_for_each_case(programs):
+    gravity = jr.torques.UniformGravity(
+        np.asarray(1.0), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    )
+    body = jr.RigidBody(np.array([2.0, 2.0, 1.0]), gravity)
+    state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 3.0]))
+    before = programs()
+    for case in (None, "kovalevskaya", None, "kovalevskaya"):
+        extra = jr.top.integrals(body, state, case).extra
+        assert extra is None if case is None else float(extra) == 1.0
+    assert programs() - before == 2
+
+
 @pytest.mark.parametrize(
     "function",
     [jr.rotation.from_matrix, jr.rotation.to_euler, jr.rotation.log],

@@ -7,6 +7,7 @@ compute. XLA's options for CPUs change that by factors.
 import gc
 from collections.abc import Callable
 from functools import cache, wraps
+from inspect import signature
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -144,7 +145,9 @@ def small_program(function: Callable[..., Any]) -> Any:
     return program(function, _NONE)
 
 
-def one_program(function: Callable[_P, _T]) -> Callable[_P, _T]:
+def one_program(
+    function: Callable[_P, _T], static: str | None = None
+) -> Callable[_P, _T]:
     """The function, compiled as one program where it is called outside of jit.
 
     Otherwise each operation of such a call is a program of its own. Sixty of them take
@@ -153,22 +156,26 @@ def one_program(function: Callable[_P, _T]) -> Callable[_P, _T]:
 
     Args:
         function: A function of numbers and of pytrees of arrays.
+        static: Name of an argument that fixes what is compiled, like an axis.
     """
     untyped: Callable[..., _T] = function
+    parameters = signature(function)
 
     @wraps(function)
-    def of_all(positional: Any, named: Any) -> _T:
-        return untyped(*positional, **named)
+    def of_all(numbers: dict[str, Any], fixed: Static) -> _T:
+        return untyped(**numbers, **dict(fixed.value))
 
     compiled = program(of_all, FULL)
 
     @wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         if outside_of_jit():
-            positional = [_as_array(x) for x in args]
-            named = {name: _as_array(x) for name, x in kwargs.items()}
-            if all(map(_is_number, jtu.tree_leaves((positional, named)))):
-                return compiled(positional, named)
+            given = parameters.bind(*args, **kwargs).arguments
+            fixed = tuple((name, x) for name, x in given.items() if name == static)
+            numbers = {k: _as_array(x) for k, x in given.items() if k != static}
+            is_one = all(map(_is_number, jtu.tree_leaves(numbers)))
+            if is_one and all(isinstance(x, int | str | None) for _, x in fixed):
+                return compiled(numbers, Static(fixed))
         return function(*args, **kwargs)
 
     return call

@@ -141,24 +141,38 @@ def in_any_order(motion: Callable[[Array], State], ts: Array) -> State:
     return State(states.attitude[back], states.omega[back])
 
 
-def _flow(
-    options: Options, system: RigidBody, before: State, start: Array, end: Array
+def flow(
+    options: Options,
+    system: RigidBody,
+    before: State,
+    start: Array,
+    end: Array,
+    steps: int | Array,
 ) -> State:
-    """States a short time after, or before, given states (n, ...), one each."""
+    """States a short time after, or before, given states (n, ...), one each.
+
+    Args:
+        options: Those of the fit.
+        system: The body.
+        before: The given states.
+        start: Their times [s].
+        end: Times of the results [s].
+        steps: How many steps are made under a torque.
+    """
     if not options.free_motion:
 
-        def flow(state: State, start: Array, end: Array) -> State:
+        def forced(state: State, start: Array, end: Array) -> State:
             return forced_flow(
                 system,
                 state,
                 start,
                 end,
                 options.depends_on_attitude,
-                steps=options.steps,
+                steps=steps,
                 jumps=options.jumps,
             )
 
-        return jax.vmap(flow)(before, start, end)
+        return jax.vmap(forced)(before, start, end)
     turn, omega = jax.vmap(lambda w, t: free_flow(system.inertia, w, t))(
         before.omega, end - start
     )
@@ -237,14 +251,14 @@ def _states(
         start = jnp.concatenate([layout.start[node], layout.start])
         end = jnp.concatenate([times, layout.end])
         before = jtu.tree_map(lambda x: jnp.concatenate([x[node], x]), nodes)
-        states = _flow(options, system, before, start, end)
+        states = flow(options, system, before, start, end, options.steps)
         return states, _picked(states, slice(sample.size, None))
     first = _picked(nodes, 0)
     whole = _integrated(options, system, first, layout.ts, layout.start[0])
     states = _picked(whole, sample)
     # The lags of a sensor are short, so that one step from its samples suffices.
     if lag is not None:
-        states = _flow(options, system, states, ts, times)
+        states = flow(options, system, states, ts, times, options.steps)
     # A trial with one node has no links, so that these ends have no effect.
     return states, nodes
 

@@ -10,17 +10,15 @@ search begins and where it ends.
 from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array
 
 from jrigid._core.compile import small_program
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
-from jrigid.identify._flow import forced_flow
 from jrigid.identify._host import conjugate, log, multiply
 from jrigid.identify._layout import Layout
-from jrigid.identify._problem import Problem, over_trials
+from jrigid.identify._problem import Problem, flow, over_trials
 from jrigid.identify._smoother import Point
 from jrigid.identify._unknowns import Unknowns
 
@@ -48,21 +46,9 @@ def _states_after(
         point: Point, leaves: tuple[AnyArray, ...], trial: Any
     ) -> tuple[Array, Array]:
         system = problem.unknowns.parts(point.numbers, point.own, leaves)[0]
-
-        def flow(state: State, start: Array, end: Array) -> State:
-            return forced_flow(
-                system,
-                state,
-                start,
-                end,
-                problem.options.depends_on_attitude,
-                steps=steps,
-                jumps=problem.options.jumps,
-            )
-
         layout = trial.layout
         nodes = State(point.attitude, point.omega)
-        after = jax.vmap(flow)(nodes, layout.start, layout.end)
+        after = flow(problem.options, system, nodes, layout.start, layout.end, steps)
         return after.attitude, after.omega
 
     return over_trials(trial, problem, layout)(point)

@@ -1,6 +1,7 @@
 """Closed forms of stability: spin about a principal axis, tops, satellites."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -90,6 +91,7 @@ def _wobble(towards: Array, back: Array) -> _Wobble:
     return _Wobble(square, root_of_positive(square), root_of_positive(-square))
 
 
+@partial(one_program, static="axis")
 def growth_rate_squared(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Scalar:
@@ -119,6 +121,7 @@ def growth_rate_squared(
     return _of_couplings(_wobble, moments, axis, spin, rotor).growth_rate_squared
 
 
+@partial(one_program, static="axis")
 def growth_rate(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Scalar:
@@ -146,6 +149,7 @@ def growth_rate(
     return _of_couplings(_wobble, moments, axis, spin, rotor).growth_rate
 
 
+@partial(one_program, static="axis")
 def frequency(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Scalar:
@@ -172,6 +176,7 @@ def frequency(
     return _of_couplings(_wobble, moments, axis, spin, rotor).frequency
 
 
+@partial(one_program, static="axis")
 def modes(
     moments: VectorLike, axis: int, spin: ScalarLike, rotor: ScalarLike = 0.0
 ) -> Modes:
@@ -215,6 +220,7 @@ def _modes(towards: Array, back: Array) -> Modes:
     return Modes(rates, shapes, jnp.sqrt(jnp.abs(back / towards)))
 
 
+@partial(one_program, static="axis")
 def linearized(
     moments: VectorLike, axis: int, omega0: VectorLike, ts: Real[ArrayLike, "..."]
 ) -> Float[Array, "... 3"]:

@@ -16,6 +16,7 @@ from jrigid._checks import (
     is_unit,
     where_defined,
 )
+from jrigid._core.compile import one_program
 from jrigid._motion import HasRigidBody, plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
@@ -47,6 +48,7 @@ class Integrals(NamedTuple):
     extra: Scalar | None
 
 
+@partial(one_program, static="case")
 def integrals(
     body: RigidBody | HasRigidBody, state: State, case: Case | None = None
 ) -> Integrals:
