@@ -107,9 +107,7 @@ def scan(motions):
     numbers, tasks = starting_points(motions)
     few = _scan.fewer_epochs(readings())
     turned = _scan.orientations()
-    first, least, _ = bench_lanes.seconds(
-        _scan.best_orientations, numbers, tasks, turned, few
-    )
+    first, least, _ = bench_lanes.seconds(_scan.scanned, numbers, tasks, turned, few)
     many = motions * len(turned)
     name = f"scan of starting points, {_readings.EPOCHS} epochs: {many:,}"
     return [name, first, least, many, None]

@@ -163,7 +163,7 @@ def scan():
     few = _scan.fewer_epochs(bench_device.readings())
     few = few._replace(ts=few.ts * (9 * YEAR / few.span), span=np.asarray(9 * YEAR))
     turned = _scan.orientations()
-    program = _scan.best_orientations
+    program = _scan.scanned
     _, least, _ = bench_lanes.seconds(program, numbers, tasks, turned, few)
     return least, MOTIONS * len(turned)
 

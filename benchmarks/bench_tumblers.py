@@ -62,10 +62,11 @@ def direction(estimates):
     )
 
 
-def pulls(alias, mirror, truth):
+def pulls(alias, others, truth):
     """Errors over stated errors of what an alias says.
 
-    Its momentum is that of the mirror if that is nearer to the true one.
+    Its momentum is that of one of the others, of the same motion, if that is nearer to
+    the true one.
     """
     estimates, errors = alias.estimates, alias.errors
     moments = truth.moments[:2] / truth.moments[2]
@@ -74,8 +75,7 @@ def pulls(alias, mirror, truth):
         truth.moments, truth.precession_period, truth.rotation_period, truth.mode
     )
     energy = ph.tumbling(truth.moments, omega).energy_ratio
-    poles = [alias] if mirror is None else [alias, mirror]
-    nearest = max(poles, key=lambda x: direction(x.estimates) @ truth.pole)
+    nearest = max([alias, *others], key=lambda x: direction(x.estimates) @ truth.pole)
     pole, spread = nearest.estimates, nearest.errors
     off = pole.longitude - np.arctan2(truth.pole[1], truth.pole[0])
     off = (off + np.pi) % (2 * np.pi) - np.pi
@@ -106,7 +106,10 @@ def one_body(seed, mode, case):
     span = max(x.ts.max() for x in curves)
     right = [same(alias, truth, span) for alias in found.aliases]
     rank = right.index(True) if any(right) else None
-    pull = pulls(found.aliases[rank or 0], found.mirror, truth)
+    others = [x for x, is_right in zip(found.aliases, right, strict=True) if is_right]
+    if found.mirror is not None:
+        others.append(found.mirror)
+    pull = pulls(found.aliases[rank or 0], others, truth)
     return found, rank, pull, seconds
 
 
@@ -146,6 +149,10 @@ def main(bodies, case, write):
         ),
         ("said to be determined, and wrong or beyond six errors", wrong),
         ("more than one tumbler fits", sum(len(x[2].aliases) > 1 for x in rows)),
+        (
+            "of these with several periods or modes",
+            sum(len(x[2].aliases) > 1 and not x[2].determined for x in rows),
+        ),
     ]
     names = ["P_phi", "P_psi", "latitude", "I1/I3", "I2/I3", "b/a", "c/b"]
     names += ["E/E0", "longitude"]

@@ -1251,3 +1251,32 @@ def test_a_rod_takes_tens_of_steps(ratio, status):
     assert np.all(np.asarray(found.status) == np.asarray(status))
     off = np.asarray(found.ratios) - moments[1:] / moments[0]
     assert np.all(np.abs(off) < 4 * np.asarray(found.ratios_errors))
+
+
+@pytest.mark.parametrize("part", ["wheel", "damper"])
+def test_parts_inside_the_body_begin_in_the_state_that_is_given(part, rng):
+    """A wheel that spins freely, and a ball in a viscous fluid; rates by simulate."""
+    if part == "wheel":
+        torque = jr.torques.SpinningMass(0.3, jnp.array([0.0, 0.0, 1.0]))
+        internal = (jnp.array(4.0),)
+    else:
+        torque = jr.torques.InternalDamper(0.2, 0.05)
+        internal = (jnp.array([0.0, 0.0, 1.0]),)
+    moments = jnp.array([1.0, 1.7, 2.3])
+    start = jr.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.5, 1.0, 0.3]), internal)
+    ts = jnp.linspace(0.0, 20.0, 120)
+    omega = jr.simulate(jr.RigidBody(moments, torque), start, ts).states.omega
+    record = identify.Rates(ts, omega + 0.01 * rng.normal(size=omega.shape), 0.01)
+    # A ball: the fit does not begin at the solution.
+    body = jr.RigidBody(5 / 3 * jnp.ones(3), torque)
+    scale = "rotor" if part == "wheel" else "trace"
+    found = identify.fit(body, record, scale=scale, start=start)
+    assert found.status == identify.Status.OK
+    off = (found.moments - moments) / found.moments_errors
+    # The trace of a system without a wheel is that of the guess.
+    assert np.max(np.abs(off)) < 4
+    with pytest.raises(ValueError, match="the state of the parts inside the body"):
+        identify.fit(body, record, scale=scale)
+    without = jr.State(start.attitude, start.omega)
+    with pytest.raises(ValueError, match="the state of the parts inside the body"):
+        identify.fit(body, record, scale=scale, start=without)

@@ -11,14 +11,15 @@ import tumbler_reference
 import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _alias as alias
-from jrigid.photometry import _inversion
 from jrigid.photometry import _model as model
 from jrigid.photometry import _nights as nights
 from jrigid.photometry import _periodogram as periodogram
 from jrigid.photometry import _readings as readings
 from jrigid.photometry import _refine as refine
 from jrigid.photometry import _search as search
+from jrigid.photometry import _spin_search as spin_search
 from jrigid.photometry import _wobble as wobble
+from jrigid.photometry._convex import even_directions
 from jrigid.photometry._inversion import in_hours
 
 HOUR = 3600.0
@@ -107,8 +108,9 @@ def numbers_of(tumbler, data, epoch):
     """The numbers of a tumbler whose axes of the fit are those of space."""
     elapsed = (epoch - 0.0) * 86400.0
     span = float(data.span)
-    ratios = np.asarray(tumbler.shape.semi_axes[1:] / tumbler.shape.semi_axes[:2])
-    logits = np.log(ratios / (1 - ratios))
+    logits = model.logits_of(
+        np.asarray(tumbler.shape.semi_axes[1:] / tumbler.shape.semi_axes[:2])
+    )
     momentum = tumbler.moments * tumbler.state.omega
     start = ph.omega_from_periods(
         tumbler.moments,
@@ -269,18 +271,15 @@ def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
         )
         numbers = numbers_of(tumbler, data, epoch)[None]
         found = search._minimised(data, numbers, task, search._LAST_STEPS)
-        found, mirror = search.beside_mirror(data, found)
-        scale = found.quadratic.chi_square[0] / 360
+        both = search._best(search._joined([found, search._mirrored(data, found)]))
+        scale = both.quadratic.chi_square[0] / 360
         assert 0.7 < scale < 1.3
-        best = alias.alias_of(
-            found.numbers[0], model.Task(*(x[0] for x in found.tasks)), data, scale
-        )
-        # A search that went to the mirror comes back to the better of the two.
-        back, other = search.beside_mirror(data, mirror)
-        least = min(x.quadratic.chi_square[0] for x in (found, mirror))
-        assert back.quadratic.chi_square[0] <= least + 1e-6
-        assert other.quadratic.chi_square[0] >= back.quadratic.chi_square[0]
-        return best, _inversion._alias_apart(best, mirror, data, scale, 25.0)
+        index = search.index_of_mirror(data, both)
+        aliases = [
+            alias.alias_of(numbers, model.Task(*task), data, scale)
+            for numbers, *task in zip(both.numbers, *both.tasks, strict=True)
+        ]
+        return aliases[0], None if index is None else aliases[index]
 
     best, mirror = tumbler_and_mirror(0.0)
     assert abs(mirror.chi_square - best.chi_square) < 1e-6
@@ -289,8 +288,10 @@ def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
     assert np.cos(turn) == pytest.approx(-1, abs=1e-9)
     assert mirror.estimates.latitude == pytest.approx(best.estimates.latitude)
     assert mirror.estimates.moments == pytest.approx(best.estimates.moments)
-    _, mirror = tumbler_and_mirror(0.3)
-    assert mirror is None
+    # Seen from outside of a plane, a fit that starts at the mirror ends far above the
+    # first one, or elsewhere.
+    best, mirror = tumbler_and_mirror(0.3)
+    assert mirror is None or mirror.chi_square > 100 + best.chi_square
 
 
 def test_a_report_names_a_mirror(inversion):
@@ -546,3 +547,82 @@ def test_periods_that_no_motion_has_are_named():
 @pytest.mark.parametrize("error", [np.nan, np.inf, 0.0])
 def test_a_period_is_written_whatever_its_error(error):
     assert in_hours(np.asarray(7200.0), np.asarray(error)).startswith("2.0000 +- ")
+
+
+def test_places_are_shared_between_groups_of_near_ones():
+    turns = np.array([[1.0], [1.1], [5.0], [1.2], [5.1], [9.0]])
+    order = [0, 1, 3, 2, 4, 5]
+    assert periodogram.shared_places(turns, order, 0.3, 1) == [0, 2, 5]
+    assert periodogram.shared_places(turns, order, 0.3, 2) == [0, 1, 2, 4, 5]
+
+
+def test_the_best_rotations_of_a_search_are_not_those_of_one_period_alone():
+    """One period has poles that are all better than those of another."""
+    turns = np.repeat([10.0, 12.0, 14.0], [20, 3, 3])
+    poles = even_directions(20)
+    pole = np.concatenate([poles, poles[:3], poles[:3]])
+    numbers = np.zeros((26, 12))
+    numbers[:, 0] = turns
+    quadratic = refine.Quadratic(np.arange(26.0), np.zeros((26, 12)), np.zeros(26))
+    frames = np.stack([spin_search.frame_of_pole(x) for x in pole])
+    spins = spin_search.Spins(numbers, frames, quadratic)
+    kept = spin_search.best(spins, 9)
+    # Three places each, in the order of chi-square.
+    np.testing.assert_array_equal(kept.numbers[:, 0], np.repeat([10, 12, 14], 3))
+    np.testing.assert_array_equal(
+        kept.quadratic.chi_square, [0, 1, 2, 20, 21, 22, 23, 24, 25]
+    )
+    # Places that no other period takes are filled.
+    assert len(spin_search.best(spins, 26).numbers) == 26
+
+
+def test_ratios_of_axes_and_their_logits():
+    ratios = np.array([0.3, 0.9])
+    logits = model.logits_of(ratios)
+    np.testing.assert_allclose(model.ratios_of(logits), ratios, rtol=1e-14)
+    # Those of a needle and of a sphere are finite.
+    limits = np.asarray(model.ratios_of(model.logits_of(np.array([0.0, 1.0]))))
+    assert limits == pytest.approx([0.02, 1.0], abs=2e-3)
+    # A needle keeps an area to see.
+    needle = np.asarray(model.semi_axes(jnp.array([-1e3, -1e3])))
+    np.testing.assert_allclose(needle, [1.0, 0.02, 0.0004], rtol=1e-12)
+
+
+def test_all_poles_of_a_rotation_are_listed(rng):
+    """Four nights of a steady ellipsoid tell its period, and not its pole."""
+    shape = ph.Ellipsoid(jnp.array([1.0, 0.7, 0.65]))
+    truth = ph.Tumbler(
+        shape.moments, 6.3 * HOUR, 1.0, 1.2, 0.7, 0.3, 0.0, shape, mode="principal-axis"
+    )
+    curves = []
+    for night in (0.0, 2.1, 9.95, 20.02):
+        ts = 86400.0 * (night + np.linspace(0, 0.25, 30))
+        angle = 0.3 + ts / 8e6
+        sun = np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * ts], axis=1)
+        observer = np.stack([np.cos(2 * angle), np.sin(2 * angle), 0 * ts], axis=1)
+        light = np.asarray(truth.light_curve(ts, sun, observer))
+        light = light * 10 ** (-0.008 * rng.normal(size=30))
+        curves.append(ph.LightCurve(0.0, ts, light, sun, observer, is_relative=True))
+    found = ph.find_tumblers(
+        curves,
+        0.02,
+        shortest=5 * HOUR,
+        longest=8 * HOUR,
+        modes=["principal-axis"],
+        pairs=5,
+    )
+    listed = [*found.aliases, *([] if found.mirror is None else [found.mirror])]
+    assert len(listed) > 2
+    assert found.determined
+    assert "differ in the direction of the angular momentum" in found.report()
+    right = [
+        x
+        for x in listed
+        if abs(float(x.estimates.latitude) - 0.7) < 4 * x.errors.latitude
+        and abs(np.sin(float(x.estimates.longitude) - 1.2)) < 4 * x.errors.longitude
+    ]
+    assert right
+    for one in found.aliases:
+        period = one.estimates.precession_period
+        assert abs(period - 6.3 * HOUR) < 5 * one.errors.precession_period
+        assert np.all(one.errors.axis_ratios <= 0.5)

@@ -43,7 +43,7 @@ from jrigid.identify._layout import (
     whole,
 )
 from jrigid.identify._minimise import tensors_at
-from jrigid.identify._problem import Options, Problem
+from jrigid.identify._problem import Options, Problem, SimulatedWithParts
 from jrigid.identify._quality import Fit
 from jrigid.identify._readings import (
     DirectReadings,
@@ -138,7 +138,9 @@ def fit(
             (inertia or None, State or None). A state is needed where the attitude
             matters and was not observed; an error below about half a turn is small
             enough. Attitudes at equal intervals are also those of a body that turns the
-            other way round between them: a state says which.
+            other way round between them: a state says which. Parts that move inside
+            the body (`torques.SpinningMass`, `torques.InternalDamper`) begin in the
+            state that is given, the same for all trials; they are not sought.
         unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
             torque, for all body axes or for each (its spectral density is the level
             squared); a `GaussMarkov`, which has a correlation time; or "estimate". A
@@ -403,7 +405,16 @@ def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -
     check_type("inertia_model", inertia_model, AbstractInertiaModel)
     check_option("loss", question.loss, ("squares", "robust"))
     refuse(systems[0], records, question.scale, inertia_model)
-    tensor, state = start_of(start, trials)
+    tensor, state, internal = start_of(start, trials)
+    motion = question.motion
+    if motion is None and bodies.carry_parts:
+        demand(
+            internal is not None,
+            "Argument `start` must hold a State with the state of the parts inside the "
+            "body in `internal`, which a fit takes as known, but it does not (at rest: "
+            "`system.with_parts(state)`).",
+        )
+        motion = SimulatedWithParts(internal)
     stated = all(x.states_noise for x in records)
     noise_known = question.absolute_sigma and stated
     kind, torque = _torque(question.unmodelled, noise_known)
@@ -417,12 +428,12 @@ def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -
     # numbers instead of six for each segment.
     of_sensors = any(x.sensor.depends_on_attitude for x in records)
     options = Options(
-        free_motion=systems[0].is_free and question.motion is None,
+        free_motion=systems[0].is_free and motion is None,
         depends_on_attitude=of_sensors or bodies.need_attitude,
         unmodelled=kind,
         robust=question.loss == "robust",
         noise_known=noise_known,
-        motion=question.motion,
+        motion=motion,
     )
     options = options._replace(shooting=_shoots(options, bodies, records, state))
     return _Task(

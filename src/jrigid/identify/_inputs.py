@@ -86,8 +86,11 @@ def _longer(function: Any, count: int) -> Any:
     return eqx.tree_at(lambda x: (x.ts, x.values), function, replace_fn=longer)
 
 
-def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
-    """The tensor to start from, if one is given, and the state of each trial."""
+def start_of(start: Any, trials: int) -> tuple[Any, State | None, Any]:
+    """The tensor to start from, the state of each trial and that of internal parts.
+
+    Each is None if it is not given.
+    """
     inertia, state = (
         start if isinstance(start, tuple) and len(start) == 2 else (None, start)
     )
@@ -97,10 +100,13 @@ def start_of(start: Any, trials: int) -> tuple[Any, State | None]:
         "Argument `start` must be a State, or a tuple of an inertia and a State "
         f"(either may be None), but it is {start!r}.",
     )
+    internal = None
     if isinstance(state, State):
+        internal = state.internal
         attitude = jnp.broadcast_to(state.attitude, (trials, 4))
         state = State(attitude, jnp.broadcast_to(state.omega, (trials, 3)))
-    return None if inertia is None else as_tensor(jnp.asarray(inertia)), state  # type: ignore[return-value]
+    tensor = None if inertia is None else as_tensor(jnp.asarray(inertia))
+    return tensor, state, internal  # type: ignore[return-value]
 
 
 def refuse(

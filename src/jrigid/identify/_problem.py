@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array
 
 from jrigid._core.inline import inlined
@@ -186,24 +187,53 @@ def _integrated(
 ) -> State:
     """States of a trial from its first one, by `simulate` or by the user's motion."""
     first = State(normalize(first.attitude), first.omega)
+    motion = simulated if options.motion is None else options.motion
+    return in_any_order(lambda times: motion(system, first, times, t0), ts)
 
-    def motion(times: Array) -> State:
-        if options.motion is not None:
-            return options.motion(system, first, times, t0)
-        # Few unknowns meet many residuals, hence forward mode. A motion that cannot be
-        # integrated is not finite, and the step that led there is rejected.
-        return simulate(
-            system,
-            first,
-            times,
-            t0=t0,
-            rtol=RTOL[times.dtype.itemsize],
-            throw=False,
-            adjoint=diffrax.ForwardMode(),
-            max_steps=100_000,
-        ).states
 
-    return in_any_order(motion, ts)
+def simulated(system: RigidBody, first: State, times: Array, t0: Array) -> State:
+    """States at the times, by `simulate`."""
+    # Few unknowns meet many residuals, hence forward mode. A motion that cannot be
+    # integrated is not finite, and the step that led there is rejected.
+    return simulate(
+        system,
+        first,
+        times,
+        t0=t0,
+        rtol=RTOL[times.dtype.itemsize],
+        throw=False,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=100_000,
+    ).states
+
+
+class SimulatedWithParts:
+    """`simulated`, for parts inside the body that begin in a given state.
+
+    Two of them are equal, and serve one compiled program, where the states are.
+    """
+
+    def __init__(self, internal: Any):
+        """Parts that begin in a state: an entry for each torque that carries parts."""
+        self._internal = jtu.tree_map(np.asarray, internal)
+        leaves, structure = jtu.tree_flatten(self._internal)
+        self._key = structure, tuple((x.tobytes(), x.shape, x.dtype) for x in leaves)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether the other one's parts begin in the same state."""
+        return isinstance(other, SimulatedWithParts) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """By the state of the parts."""
+        return hash(self._key)
+
+    def __call__(
+        self, system: RigidBody, first: State, times: Array, t0: Array
+    ) -> State:
+        """States at the times."""
+        internal = jtu.tree_map(jnp.asarray, self._internal)
+        first = State(first.attitude, first.omega, internal)
+        return simulated(system, first, times, t0)
 
 
 def _picked(state: State, index: Array | slice | int) -> State:

@@ -531,7 +531,8 @@ def _torques(
 
     def at(trial: Array, t: Array, q: Array, w: Array) -> Array:
         system = unknowns.original(trial)[0]
-        return jnp.asarray(system.torque_on(t, State(q, w), None), w.dtype)
+        state = system.with_parts(State(q, w))
+        return jnp.asarray(system.torque_on(t, state, None), w.dtype)
 
     of_trial = jax.vmap(at, (None, 0, 0, 0))
     return jax.vmap(of_trial)(jnp.arange(len(ts)), ts, attitude, omega)

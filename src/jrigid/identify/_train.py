@@ -33,9 +33,15 @@ _METHOD = method_of(diffrax.Tsit5())
 # Longest step [rad]. After 50 gaps of up to 0.2 rad the error is below 1e-6 of the
 # state.
 _TURN = 0.2
-# Gauss-Newton steps to the state of a segment. Two are enough, because the observed
-# state is off by the noise alone.
-_NEWTON = 2
+# Levenberg-Marquardt steps to the state of a segment. Where the torque is nearly right
+# two are enough, because the observed state is off by the noise alone. A wrong torque
+# bends a long segment away from its samples, and moves the best state far.
+_STEPS_TO_STATE = 30
+_FIRST_DAMPING = 1e-3
+_FALL, _RISE = 0.1, 10.0  # of the damping after a step that helps, or does not
+# The state is found where a step promises less than this part of chi-square: the slope
+# in the parameters is that at the best state.
+_ENOUGH = 1e-8
 _RIDGE = 1e-12  # of the normal equations, for a turn that no sample shows
 
 
@@ -506,22 +512,74 @@ def _chi_square(task: _Task, params: PyTree, segment: _Segments) -> tuple[Array,
     # slope in the parameters is therefore that with the state held.
     held = jax.lax.stop_gradient(params)
 
-    def rows_twice(move: Array) -> tuple[Array, Array]:
-        residuals = rows(held, move)
-        # `jacfwd` returns a value only as an auxiliary output.
-        return residuals, residuals
+    def at(move: Array) -> _AtState:
+        def rows_twice(move: Array) -> tuple[Array, Array]:
+            residuals = rows(held, move)
+            # `jacfwd` returns a value only as an auxiliary output.
+            return residuals, residuals
 
-    def gauss_newton(_: Array | int, move: Array) -> Array:
         slopes, residuals = jax.jacfwd(rows_twice, has_aux=True)(move)
-        normal = product("ni,nj->ij", slopes, slopes)
-        eye = jnp.eye(move.size, dtype=move.dtype)
-        normal = normal + _RIDGE * jnp.trace(normal) * eye
-        return move - jnp.linalg.solve(normal, product("ni,n->i", slopes, residuals))
+        return _AtState(
+            move=move,
+            square=jnp.sum(residuals**2),
+            slope=product("ni,n->i", slopes, residuals),
+            normal=product("ni,nj->ij", slopes, slopes),
+        )
 
     size = 6 if task.depends_on_attitude else 3
     no_move = jnp.zeros(size, guess.omega.dtype)
-    move = jax.lax.fori_loop(0, _NEWTON, gauss_newton, no_move)
+    move = jax.lax.stop_gradient(_best_move(at, no_move))
     return jnp.sum(rows(params, move) ** 2), jnp.sum(samples.weight) - size
+
+
+class _AtState(NamedTuple):
+    """Chi-square of a segment about a state: its value, half its slope, its bend."""
+
+    move: Array
+    square: Array
+    slope: Array
+    normal: Array
+
+
+class _Loop(NamedTuple):
+    """The best state so far and what comes next."""
+
+    best: _AtState
+    damping: Array
+    going: Array
+    steps: Array
+
+
+def _best_move(at: Callable[[Array], _AtState], first: Array) -> Array:
+    """The state of a segment with the least chi-square, by Levenberg and Marquardt."""
+
+    def step(loop: _Loop) -> _Loop:
+        best = loop.best
+        diagonal = loop.damping * jnp.diagonal(best.normal)
+        diagonal = diagonal + _RIDGE * jnp.trace(best.normal)
+        move = jnp.linalg.solve(best.normal + jnp.diag(diagonal), -best.slope)
+        # The quadratic model changes by 2 m.s + m.N m.
+        bent = product("i,ij,j->", move, best.normal, move)
+        promised = -2 * product("i,i->", move, best.slope) - bent
+        new = at(best.move + move)
+        better = new.square < best.square
+        return _Loop(
+            best=jtu.tree_map(lambda a, b: jnp.where(better, a, b), new, best),
+            damping=loop.damping * jnp.where(better, _FALL, _RISE),
+            going=promised > _ENOUGH * best.square,
+            steps=loop.steps + 1,
+        )
+
+    loop = _Loop(
+        best=at(first),
+        damping=jnp.asarray(_FIRST_DAMPING, first.dtype),
+        going=jnp.asarray(True),
+        steps=jnp.asarray(0),
+    )
+    loop = jax.lax.while_loop(
+        lambda loop: loop.going & (loop.steps < _STEPS_TO_STATE), step, loop
+    )
+    return loop.best.move
 
 
 def _motion(

@@ -21,6 +21,7 @@ from jrigid.photometry._model import (
     geometry_of,
     independent,
     inverse_moments,
+    ratios_of,
     rows_of,
     semi_axes,
     sought,
@@ -38,6 +39,8 @@ Errors = TypeVar("Errors")
 _NAMES = {mode: name for name, mode in MODES.items()}
 # Least eigenvalue of a scaled normal matrix: no error is more than this^-1/2 larger.
 _LEAST = 1e-15
+# Nothing between 0 and 1 has a larger standard deviation.
+_LARGEST_OF_RATIO = 0.5
 
 
 class Estimates(NamedTuple):
@@ -98,10 +101,13 @@ def alias_of(
     covariance = scale * covariance_of(normal, np.asarray(sought(task)))
     span = np.asarray(readings.span)
     estimates, of_numbers = _estimates_and_slopes(numbers, task, span)
+    errors = errors_of(of_numbers, covariance)
     return Alias(
         tumbler=tumbler_of(numbers, task, estimates),
         estimates=jax.tree.map(np.asarray, estimates),
-        errors=errors_of(of_numbers, covariance),
+        errors=errors._replace(
+            axis_ratios=np.minimum(errors.axis_ratios, _LARGEST_OF_RATIO)
+        ),
         chi_square=float(np.sum(np.asarray(rows) ** 2)),
         weight=0.0,
         # The last row is no point, but the equation between the periods.
@@ -166,7 +172,8 @@ def log_evidence(alias: Alias, growth: float, width: float) -> float:
     # The integral over a peak of n numbers has the factor (2 pi)^(n / 2).
     peak = spread + 0.5 * len(size) * np.log(2 * np.pi)
     # The prior is flat in solid angle and in ratios, not in latitude and in logits.
-    # A ratio r of the logit x has dr / dx = r (1 - r), which may underflow.
+    # With p the part of the range of ratios that lies below it, a logit x has
+    # dp / dx = p (1 - p), which may underflow.
     slopes = [
         -np.logaddexp(0, x) - np.logaddexp(0, -x)
         for x in (numbers.shape, numbers.inertia)
@@ -216,7 +223,7 @@ def estimates_at(vector: Array, task: Task, span: Array) -> Estimates:
         latitude=jnp.arcsin(jnp.clip(pole[2], -1.0, 1.0)),
         energy_ratio=jnp.where(tumbles, energy, 1.0),
         moments=jnp.where(tumbles, moments[:2], jnp.nan),
-        axis_ratios=jax.nn.sigmoid(numbers.shape),
+        axis_ratios=ratios_of(numbers.shape),
     )
 
 

@@ -24,7 +24,6 @@ from jrigid.photometry._nights import (
     predictions,
 )
 from jrigid.photometry._periodogram import cycles_within, points_of
-from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import (
     Readings,
     check_threshold,
@@ -33,7 +32,7 @@ from jrigid.photometry._readings import (
     readings_of,
     stated_noise,
 )
-from jrigid.photometry._search import Found, beside_mirror, search
+from jrigid.photometry._search import APART, Found, index_of_mirror, search
 
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.
@@ -45,8 +44,12 @@ _ROUND = (
     "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
     "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
 )
-# Radians between the momenta of a tumbler and of its mirror within which they are one.
-_ONE_POLE = 0.2
+# A ratio of two axes below which no known asteroid is.
+_THIN = 0.1
+_IS_THIN = (
+    "   an ellipsoid as thin as no known body: the curves are few for its shape, and the "
+    "errors mean little"
+)
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -68,10 +71,12 @@ class Inversion:
         follows: Whether the best alias follows the curves to their noise, as far as it
             is known: if it is not stated, its residuals need only be uncorrelated. This
             says little of curves whose points are far apart in time.
-        determined: Whether one tumbler alone explains the curves, but for its mirror:
-            the best one follows them, and there is no other alias.
+        determined: Whether the curves determine the motion: the best alias follows
+            them, and all others have its periods and its mode. Their momenta may point
+            elsewhere.
         mirror: The best alias mirrored by the plane from which the body was seen, whose
-            momentum is elsewhere. None if its chi-square is not near the least one.
+            momentum is elsewhere. It is not among the aliases. None if its chi-square
+            is not near the least one.
         span: Time from the first epoch to the last [s].
         is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
             holds what the model misses.
@@ -247,7 +252,6 @@ def _inversion(
         threshold: Largest growth of chi-square of an alias.
         width: Of the range of frequencies that were searched [cycles].
     """
-    found, mirror = beside_mirror(readings, found)
     tasks = [Task(*fields) for fields in zip(*found.tasks, strict=True)]
     unknown = readings.factor_count() + int(np.count_nonzero(independent(tasks[0])))
     freedom = points_of(curves) - unknown
@@ -266,7 +270,11 @@ def _inversion(
         every.append(alias_of(numbers, task, readings, scale))
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
-    aliases = _weighted(every[:near], growth, width)
+    mirror = index_of_mirror(readings, found)
+    if mirror is not None and mirror >= near:
+        mirror = None
+    others = [i for i in range(near) if i != mirror]
+    aliases = _weighted([every[i] for i in others], growth[others], width)
     correlation, is_followed = follows(
         every[0].residuals, curves, reduced, freedom, stated
     )
@@ -280,11 +288,11 @@ def _inversion(
         degrees_of_freedom=freedom,
         correlation=correlation,
         follows=is_followed,
-        determined=near == 1 and is_followed,
+        determined=is_followed and all(_is_same_motion(aliases[0], x) for x in aliases),
         span=float(readings.span),
         is_noise_found=not stated,
         is_homogeneous=bool(tasks[0].homogeneous),
-        mirror=_alias_apart(every[0], mirror, readings, scale, threshold),
+        mirror=None if mirror is None else every[mirror],
     )
 
 
@@ -310,31 +318,10 @@ def _weighted(
     ]
 
 
-def _alias_apart(
-    best: Alias, mirror: Found, readings: Readings, scale: float, threshold: float
-) -> Alias | None:
-    """The best tumbler's mirror, where it explains the light curves as well.
-
-    Args:
-        best: The best tumbler.
-        mirror: Its mirror, if there is one.
-        readings: The light curves.
-        scale: Chi-square of the best tumbler over its degrees of freedom.
-        threshold: Largest growth of chi-square of an alias.
-    """
-    if not len(mirror.numbers):
-        return None
-    growth = mirror.quadratic.chi_square[0] - best.chi_square
-    if growth > threshold * scale:
-        return None
-    task = Task(*(x[0] for x in mirror.tasks))
-    other = alias_of(mirror.numbers[0], task, readings, scale)
-    poles = [
-        direction_of_pole(x.longitude, x.latitude)
-        for x in (best.estimates, other.estimates)
-    ]
-    is_apart = poles[0] @ poles[1] < np.cos(_ONE_POLE)
-    return other if is_apart else None
+def _is_same_motion(one: Alias, other: Alias) -> bool:
+    """Whether two aliases have the same periods and mode."""
+    apart = np.abs(one.numbers[:2] - other.numbers[:2])
+    return bool(np.all(apart < APART)) and one.tumbler.mode == other.tumbler.mode
 
 
 def report_of(inversion: Inversion) -> str:
@@ -383,8 +370,14 @@ def _verdict(inversion: Inversion) -> str:
             f"{inversion.correlation:.2f}. A stated noise is too small, the body is no "
             "ellipsoid, or its periods were not among the `pairs`."
         )
-    if inversion.determined:
+    if count == 1:
         return f"One tumbler explains the light curves: {value}."
+    if inversion.determined:
+        return (
+            f"{count} tumblers explain the light curves. They have the same periods and "
+            "mode, and differ in the direction of the angular momentum or in the shape: "
+            f"{value}."
+        )
     return (
         f"{count} tumblers explain the light curves, which do not say which one is "
         f"true: {value}."
@@ -414,6 +407,8 @@ def _described(rank: int, alias: Alias) -> list[str]:
         )
     )
     lines = [head, periods, pole, f"   {shape}"]
+    if np.min(x.axis_ratios) < _THIN:
+        lines.append(_IS_THIN)
     if mode != "principal-axis":
         lines.append(f"   E/E0 {x.energy_ratio:.4f} +- {error.energy_ratio:.4f}")
         if _is_round(alias):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -31,7 +32,7 @@ class Numbers(NamedTuple):
         angles: Mean angle of precession and phase of rotation at time 0 [rad].
         pole: Longitude and latitude of the momentum, in the axes of the fit [rad].
         log_tangent: Logarithm of the tangent of the largest tilt.
-        shape: Logits of the ratios b/a and c/b of the semi-axes.
+        shape: Logits of the ratios b/a and c/b of the semi-axes, see `ratios_of`.
         inertia: The same of the homogeneous ellipsoid that has the moments of inertia.
     """
 
@@ -44,6 +45,10 @@ class Numbers(NamedTuple):
 
 
 COUNT = 11
+# Ratios of semi-axes are no smaller, so that a needle keeps an area to see.
+_LEAST_RATIO = 0.02
+# A ratio of 1, or the least one, has no logit: it is taken this far from them.
+_OFF_LIMIT = 1e-3
 _SLICES = Numbers(
     *(slice(i, j) for i, j in [(0, 2), (2, 4), (4, 6), (6, 7), (7, 9), (9, 11)])
 )
@@ -99,10 +104,22 @@ def independent(task: Task) -> Bool[Array, " 11"]:
     return sought(task).at[_SLICES.log_tangent].set(False)
 
 
+def ratios_of(logits: Float[AnyArray, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
+    """Ratios b/a and c/b of semi-axes, between the least one and 1."""
+    return _LEAST_RATIO + (1 - _LEAST_RATIO) * jax.nn.sigmoid(jnp.asarray(logits))
+
+
+def logits_of(ratios: Float[np.ndarray, "*lanes 2"]) -> Float[np.ndarray, "*lanes 2"]:
+    """The inverse of `ratios_of`, for any ratios from 0 to 1."""
+    part = (ratios - _LEAST_RATIO) / (1 - _LEAST_RATIO)
+    part = np.clip(part, _OFF_LIMIT, 1 - _OFF_LIMIT)
+    return np.log(part / (1 - part))
+
+
 def semi_axes(logits: Float[Array, "2"]) -> Vector:
     """Semi-axes of which the longest is 1, from logits of b/a and c/b."""
     # Ratios below 1 keep the order of the axes, so that none changes its role in a fit.
-    ratios = jax.nn.sigmoid(logits)
+    ratios = ratios_of(logits)
     return jnp.stack([jnp.ones_like(ratios[0]), ratios[0], ratios[0] * ratios[1]])
 
 

@@ -209,6 +209,25 @@ def unlike(
     return chosen
 
 
+def shared_places(
+    places: Float[np.ndarray, "many n"], order: list[int], apart: float, most: int
+) -> list[int]:
+    """Indices in their order, of which at most so many are not apart from one another.
+
+    Args:
+        places: Where each index is.
+        order: Some of the indices, the best first.
+        apart: Distance from which places are apart, along one axis at least.
+        most: How many may be near each other.
+    """
+    chosen: list[int] = []
+    for index in order:
+        gaps = np.abs(places[index] - places[chosen]).max(axis=1)
+        if np.count_nonzero(gaps <= apart) < most:
+            chosen.append(index)
+    return chosen
+
+
 def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
     """1, and how far the bisector is along the two directions in which it moves most.
 

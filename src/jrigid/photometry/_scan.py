@@ -7,12 +7,11 @@ precession, since these only turn the directions of the Sun and of the observer.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jrigid._numerics import product
 from jrigid._types import Vector
@@ -25,30 +24,25 @@ from jrigid.photometry._model import (
 )
 from jrigid.photometry._readings import EPOCHS, Readings, filled, orthonormal
 
-_POLES = 24
-_ANGLES = 8
+POLES = 24
+ANGLES = 8
 _LANES = 4  # motions at once: each has all directions as lanes of its own
-_KEPT = 2  # best directions of each motion
-
-
-class Directions(NamedTuple):
-    """Best orientations of each lane: chi-square, and the index of the orientation."""
-
-    chi_square: Float[np.ndarray, "lanes kept"]
-    index: Int[np.ndarray, "lanes kept"]
 
 
 def orientations() -> Float[np.ndarray, "many 3 3"]:
-    """Axes with z along the momentum, rows in space: even poles, and turns about them."""
+    """Axes with z along the momentum, rows in space: even poles, and turns about them.
+
+    Those of one pole follow each other.
+    """
     # Imported where it is used: scipy takes a second, which `import jrigid` must not.
     from scipy.spatial.transform import Rotation
 
-    index = np.arange(_POLES) + 0.5
+    index = np.arange(POLES) + 0.5
     # Equal steps of the sine of the latitude are equal areas of the sphere, and the
     # golden ratio spreads the longitudes.
-    latitude = np.arcsin(1 - 2 * index / _POLES)
+    latitude = np.arcsin(1 - 2 * index / POLES)
     longitude = np.pi * (1 + 5**0.5) * index
-    turns = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    turns = 2 * np.pi * np.arange(ANGLES) / ANGLES
     angles = [
         (b, np.pi / 2 - a, turn)
         for a, b in zip(latitude, longitude, strict=True)
@@ -77,13 +71,13 @@ def fewer_epochs(readings: Readings, count: int = EPOCHS) -> Readings:
 
 
 @jax.jit
-def best_orientations(
+def scanned(
     numbers: Float[Array, "lanes 11"],
     tasks: Task,
     turned: Float[Array, "many 3 3"],
     readings: Readings,
-) -> tuple[Float[Array, "lanes kept"], Int[Array, "lanes kept"]]:
-    """Chi-square of the best orientations of each lane, in single precision.
+) -> Float[Array, "lanes many"]:
+    """Chi-square of each lane in all orientations, in single precision.
 
     Args:
         numbers: Their poles and angles of precession are not used.
@@ -97,7 +91,7 @@ def best_orientations(
     few = jax.tree.map(lambda x: x.astype(jnp.float32), readings)
     times = readings.ts / readings.span
 
-    def of_lane(lane: tuple[Array, Task]) -> tuple[Array, Array]:
+    def of_lane(lane: tuple[Array, Task]) -> Array:
         vector, task = lane
         geometry = geometry_of(unpacked(vector), task)
         of_time = functools.partial(directions_of_axes, geometry, task.mode)
@@ -107,9 +101,7 @@ def best_orientations(
         semi_axes = geometry.axes.astype(jnp.float32)
         each = functools.partial(_chi_square, semi_axes, axes, few)
         values = jax.vmap(each)(to_sun, to_observer)
-        values = jnp.where(jnp.isfinite(values), values, jnp.inf)
-        best, index = jax.lax.top_k(-values, _KEPT)
-        return -best, index
+        return jnp.where(jnp.isfinite(values), values, jnp.inf)
 
     return jax.lax.map(of_lane, (numbers, tasks), batch_size=_LANES)
 

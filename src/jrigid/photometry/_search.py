@@ -1,7 +1,7 @@
 """The search for tumblers that explain light curves: candidates, scan, refinement."""
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,17 +15,20 @@ from jrigid.photometry._model import (
     Numbers,
     Task,
     gap_of_periods,
+    logits_of,
     motion_of,
     unpacked,
 )
 from jrigid.photometry._periodogram import frequency_pairs, strongest_lines, unlike
+from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
 from jrigid.photometry._refine import Quadratic, refined
 from jrigid.photometry._scan import (
-    best_orientations,
+    ANGLES,
     fewer_epochs,
     frame_of,
     orientations,
+    scanned,
 )
 
 # Ratios of the semi-axes b/a and c/b that a scan tries.
@@ -34,9 +37,15 @@ _PHASES = np.pi * np.arange(6) / 6  # half a turn of the polhode looks like the 
 _TILTS = np.linspace(-2.5, 3.5, 61)  # logarithms of tangents in a table
 # Starting points of each pair of periods that are refined.
 _STARTS = 3
+# Best directions of the momentum that each motion is tried with.
+_DIRECTIONS = 2
 # The best periods, and the starting points of each, when they are looked at again.
 _AGAIN = 8
 _MANY_STARTS = 12
+# The best periods that are looked at from all poles, if chi-square is no larger than so
+# many times the least one.
+_FROM_ALL_POLES = 4
+_MUCH_WORSE = 2.0
 _FIRST_STEPS = 6
 # Then the better half goes on, so many times, for so many steps each; the last ones are
 # refined to their end.
@@ -44,8 +53,10 @@ _FINALISTS = 48
 _HALVINGS = 2
 _NEXT_STEPS = 8
 _LAST_STEPS = 80
-# Tumblers whose cycles within the span differ by less than this are one.
-_APART = 0.3
+# Tumblers are one if their cycles within the span differ by less than this, and the
+# directions of their momenta by less than a quarter of a radian.
+APART = 0.3
+_APART_IN_POLE = 0.25
 # Weight of the equation between the periods and the moments: loose first, so that the
 # numbers find each other, then to a millionth.
 _LOOSE = 300.0
@@ -53,8 +64,13 @@ _TIGHT = 1e6
 _LANES_OF_SCAN = 512
 _LANES = 16
 
+# A mirror's momentum is as far from that of the reflection, but for what the curves
+# tell.
+_NEAR_MIRROR = 0.6
 
 Tree = TypeVar("Tree")
+# Rows and columns of some of a table of values.
+Choice: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 class Found(NamedTuple):
@@ -73,7 +89,9 @@ def search(
     homogeneous: bool,
     pairs: int,
 ) -> Found:
-    """Tumblers that explain the readings, unlike in their periods or their mode.
+    """Tumblers that explain the readings, unlike in their periods, mode or momentum.
+
+    The mirror of the best one is among them where it is a minimum.
 
     Args:
         readings: The light curves.
@@ -98,33 +116,56 @@ def search(
             candidates = np.stack([candidates, np.zeros_like(candidates)], axis=1)
         else:
             candidates = cycles
-        found += _from_candidates(readings, candidates, mode, _STARTS)
+        found += _from_candidates(readings, candidates, mode, _few(_STARTS))
     demand(
         len(found) > 0,
         "Arguments `shortest` and `longest` must hold the periods of a motion of these "
         "`modes`, but they do not: choose a wider range.",
     )
-    best = _settled(readings, _joined(found), homogeneous=True)
     # The best periods are looked at again, from more starting points.
+    best = _unlike_periods(_joined(found), _AGAIN)
     for mode in modes:
-        of_mode = best.tasks.mode[:_AGAIN] == mode
-        candidates = _neighbours(best.numbers[:_AGAIN, :2][of_mode], mode)
-        found += _from_candidates(readings, candidates, mode, _MANY_STARTS)
-    return _settled(readings, _joined(found), homogeneous)
+        candidates = _neighbours(best.numbers[best.tasks.mode == mode, :2], mode)
+        found += _from_candidates(readings, candidates, mode, _few(_MANY_STARTS))
+    # A search keeps few points of one motion, and would miss other poles.
+    best = _unlike_periods(_joined(found), _FROM_ALL_POLES)
+    least = best.quadratic.chi_square[0]
+    best = _chosen(best, best.quadratic.chi_square < _MUCH_WORSE * least)
+    for mode in modes:
+        cycles = best.numbers[best.tasks.mode == mode, :2]
+        found += _from_all_poles(readings, cycles, mode)
+    joined = _best(_joined(found))
+    if not homogeneous:
+        joined = _with_own_moments(readings, joined)
+    return _best(_joined([joined, _mirrored(readings, joined)]))
 
 
-def beside_mirror(readings: Readings, found: Found) -> tuple[Found, Found]:
-    """The points with the better of the best one and its mirror first, and the other.
+def _with_own_moments(readings: Readings, found: Found) -> Found:
+    """The points with moments that are sought apart from the ellipsoid."""
+    numbers = found.numbers.copy()
+    # The search for the moments begins at those of the ellipsoid that is seen.
+    numbers[:, 9:11] = numbers[:, 7:9]
+    tasks = found.tasks._replace(homogeneous=np.zeros(len(numbers), bool))
+    return _best(_minimised(readings, numbers, tasks, _LAST_STEPS))
 
-    There may be no other.
-    """
-    mirror = _mirrored(readings, found)
-    if not len(mirror.numbers):
-        return found, mirror
-    if mirror.quadratic.chi_square[0] >= found.quadratic.chi_square[0]:
-        return found, mirror
-    others = np.arange(1, len(found.numbers))
-    return _joined([mirror, _chosen(found, others)]), _chosen(found, [0])
+
+def poles_of(found: Found) -> Float[np.ndarray, "many 3"]:
+    """Directions of the momenta in space."""
+    longitude, latitude = unpacked(found.numbers).pole.T
+    inside = direction_of_pole(longitude, latitude)
+    return np.einsum("ni,nij->nj", inside, found.tasks.frame)
+
+
+def index_of_mirror(readings: Readings, found: Found) -> int | None:
+    """Which point is the mirror of the first one, if one is."""
+    poles = poles_of(found)
+    mirrored = -poles[0] @ _reflection(readings)
+    apart = np.linalg.norm(poles - mirrored, axis=1)
+    places = _motions_of(found)
+    same = np.all(np.abs(places - places[0]) < APART, axis=1)
+    same &= apart < _NEAR_MIRROR
+    same[0] = False
+    return int(np.argmin(np.where(same, apart, np.inf))) if np.any(same) else None
 
 
 def _mirrored(readings: Readings, found: Found) -> Found:
@@ -134,12 +175,16 @@ def _mirrored(readings: Readings, found: Found) -> Found:
     an ellipsoid looks the same from opposite sides. Therefore the rotation -M R has the
     light curves of R. Its momentum is -M L. It has the same periods and moments.
     """
+    best = _chosen(found, [0])
+    tasks = best.tasks._replace(frame=-best.tasks.frame @ _reflection(readings))
+    return _minimised(readings, best.numbers, tasks, _LAST_STEPS)
+
+
+def _reflection(readings: Readings) -> Float[np.ndarray, "3 3"]:
+    """Reflection at the plane from which the body was seen."""
     directions = np.concatenate([readings.to_sun, readings.to_observer])
     _, _, axes = np.linalg.svd(directions, full_matrices=False)
-    reflection = np.eye(3) - 2 * np.outer(axes[2], axes[2])
-    best = _chosen(found, [0])
-    tasks = best.tasks._replace(frame=-best.tasks.frame @ reflection)
-    return _minimised(readings, best.numbers, tasks, _LAST_STEPS)
+    return np.eye(3) - 2 * np.outer(axes[2], axes[2])
 
 
 def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
@@ -152,13 +197,25 @@ def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
 
 
 def _from_candidates(
-    readings: Readings, candidates: np.ndarray, mode: Mode, count: int
+    readings: Readings, candidates: np.ndarray, mode: Mode, choose: Choice
 ) -> list[Found]:
-    """What so many starting points of each candidate lead to, if there are any."""
+    """What the chosen starting points of each candidate lead to, if there are any."""
     numbers, of_candidate = _motions(candidates, mode)
     if len(numbers) == 0:
         return []
-    return [_refined(readings, _starts(readings, numbers, of_candidate, mode, count))]
+    return [_refined(readings, _starts(readings, numbers, of_candidate, mode, choose))]
+
+
+def _from_all_poles(
+    readings: Readings, candidates: np.ndarray, mode: Mode
+) -> list[Found]:
+    """What starting points at all poles lead to, for each candidate by itself."""
+    numbers, of_candidate = _motions(candidates, mode)
+    if len(numbers) == 0:
+        return []
+    starts = _starts(readings, numbers, of_candidate, mode, _each_pole)
+    parts = np.split(np.arange(len(starts.numbers)), len(np.unique(of_candidate)))
+    return [_refined(readings, _chosen(starts, rows)) for rows in parts]
 
 
 def _starts(
@@ -166,38 +223,52 @@ def _starts(
     numbers: np.ndarray,
     of_candidate: np.ndarray,
     mode: Mode,
-    count: int,
+    choose: Choice,
 ) -> Found:
-    """The best orientations of the best motions for each candidate."""
+    """Chosen orientations of the motions of each candidate."""
     turned = orientations()
     few = fewer_epochs(readings)
     tasks = _tasks(len(numbers), mode, _LOOSE)
-    scan = best_orientations
-    values, index = _in_blocks(
-        _LANES_OF_SCAN, lambda x, y: scan(x, y, turned, few), numbers, tasks
+    values = _in_blocks(
+        _LANES_OF_SCAN, lambda x, y: scanned(x, y, turned, few), numbers, tasks
     )
-    chosen = [
-        _best_few(values, np.flatnonzero(of_candidate == k), count)
-        for k in np.unique(of_candidate)
-    ]
-    motion, rank = np.concatenate(chosen).T
-    frames = [frame_of(turned[i]) for i in index[motion, rank]]
+    chosen = []
+    for k in np.unique(of_candidate):
+        rows = np.flatnonzero(of_candidate == k)
+        row, column = choose(values[rows]).T
+        chosen.append(np.stack([rows[row], column], axis=1))
+    motion, orientation = np.concatenate(chosen).T
+    frames = [frame_of(turned[i]) for i in orientation]
     tasks = _rows(tasks, motion)._replace(frame=np.array(frames).reshape(-1, 3, 3))
-    return Found(numbers[motion], tasks, Quadratic(values[motion, rank], None, None))
+    at = Quadratic(values[motion, orientation], None, None)
+    return Found(numbers[motion], tasks, at)
 
 
-def _best_few(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
-    """Row and column of the least values in some rows."""
-    order = np.argsort(values[rows], axis=None)[:count]
-    row, column = np.unravel_index(order, values[rows].shape)
-    found = np.stack([rows[row], column], axis=1)
-    return found[np.isfinite(values[found[:, 0], found[:, 1]])]
+def _few(count: int) -> Choice:
+    """The best points, of which each motion has at most two."""
+
+    def choose(values: np.ndarray) -> np.ndarray:
+        columns = np.argsort(values, axis=1)[:, :_DIRECTIONS]
+        each = np.take_along_axis(values, columns, axis=1)
+        row, rank = np.unravel_index(np.argsort(each, axis=None)[:count], each.shape)
+        chosen = np.stack([row, columns[row, rank]], axis=1)
+        return chosen[np.isfinite(each[row, rank])]
+
+    return choose
+
+
+def _each_pole(values: np.ndarray) -> np.ndarray:
+    """The best motion and angle for each pole, those of no light included."""
+    columns = np.arange(values.shape[1]).reshape(-1, ANGLES)
+    of_pole = np.swapaxes(values[:, columns], 0, 1).reshape(len(columns), -1)
+    row, angle = np.divmod(np.argmin(of_pole, axis=1), ANGLES)
+    return np.stack([row, columns[np.arange(len(columns)), angle]], axis=1)
 
 
 def _motions(candidates: np.ndarray, mode: Mode) -> tuple[np.ndarray, np.ndarray]:
     """Numbers for each candidate, shape and phase, and the candidate of each."""
     ratios = np.array(_RATIOS)
-    logits = np.log(ratios / (1 - ratios))
+    logits = logits_of(ratios)
     if mode == Mode.principal_axis:
         tilts = np.zeros((len(candidates), len(ratios)))
         phases = np.zeros(1)
@@ -266,27 +337,29 @@ def _refined(readings: Readings, starts: Found) -> Found:
         order = np.argsort(found.quadratic.chi_square)
         found = _chosen(found, order[: _FINALISTS // 2**halving])
         found = _minimised(readings, found.numbers, found.tasks, _NEXT_STEPS)
-    found = _best(found, len(found.numbers))
+    found = _best(found)
     tasks = found.tasks._replace(link=np.full(len(found.numbers), _TIGHT))
     return _minimised(readings, found.numbers, tasks, _LAST_STEPS)
 
 
-def _best(found: Found, count: int) -> Found:
-    """The best points, unlike in their frequencies or their modes."""
-    places = np.column_stack([found.numbers[:, :2], found.tasks.mode])
-    return _chosen(found, unlike(places, -found.quadratic.chi_square, _APART, count))
+def _motions_of(found: Found) -> Float[np.ndarray, "many 3"]:
+    """What tells motions apart: their frequencies and their modes."""
+    return np.column_stack([found.numbers[:, :2], found.tasks.mode])
 
 
-def _settled(readings: Readings, found: Found, homogeneous: bool) -> Found:
-    """The points with moments of their own, if they are sought; the best first."""
-    found = _best(found, len(found.numbers))
-    if not homogeneous:
-        numbers = found.numbers.copy()
-        # The search for the moments begins at those of the ellipsoid that is seen.
-        numbers[:, 9:11] = numbers[:, 7:9]
-        tasks = found.tasks._replace(homogeneous=np.zeros(len(numbers), bool))
-        found = _minimised(readings, numbers, tasks, _LAST_STEPS)
-    return _best(found, len(found.numbers))
+def _best(found: Found) -> Found:
+    """The points that are unlike in their motions or their momenta, the best first."""
+    # In this scale one threshold serves the cycles and the directions.
+    poles = poles_of(found) * APART / _APART_IN_POLE
+    places = np.column_stack([_motions_of(found), poles])
+    merits = -found.quadratic.chi_square
+    return _chosen(found, unlike(places, merits, APART, len(places)))
+
+
+def _unlike_periods(found: Found, count: int) -> Found:
+    """The best points that are unlike in their motions."""
+    merits = -found.quadratic.chi_square
+    return _chosen(found, unlike(_motions_of(found), merits, APART, count))
 
 
 def _minimised(
@@ -302,8 +375,8 @@ def _minimised(
 
 
 def _in_blocks(
-    lanes: int, function: Callable[..., tuple], numbers: np.ndarray, tasks: Task
-) -> tuple:
+    lanes: int, function: Callable[..., Any], numbers: np.ndarray, tasks: Task
+) -> Any:
     """Results of a function for all lanes, by a program for so many of them."""
     blocks = []
     for first in range(0, len(numbers), lanes):

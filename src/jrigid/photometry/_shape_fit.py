@@ -42,6 +42,7 @@ from jrigid.photometry._model import (
     directions_of_axes,
     gap_of_periods,
     geometry_of,
+    logits_of,
     unpacked,
 )
 from jrigid.photometry._pole import direction_of_pole
@@ -70,8 +71,6 @@ _STEPS = 200  # for each of these weights
 # Weights of the equation between the periods and the moments: loose first, so that
 # the numbers find each other, then to a millionth.
 _LINKS = (300.0, 1e4, 1e6)
-# A ratio of semi-axes that is 1 or 0 has no logit.
-_LEAST_RATIO = 1e-3
 # Ratios of semi-axes nearer to 0 or 1 than this are at their limit.
 _AT_LIMIT = 0.02
 # Of the numbers of the motion, two are the axes of an ellipsoid, which facets replace.
@@ -305,7 +304,7 @@ def _start(
         pole=np.zeros(2),
         log_tangent=np.log(np.tan(np.asarray(tilt)))[None],
         shape=np.zeros(2),
-        inertia=_logits(of_moments),
+        inertia=logits_of(of_moments[1:] / of_moments[:-1]),
     )
     vector = surface.centre.copy()
     vector[: surface.motion] = np.concatenate(motion)
@@ -313,12 +312,6 @@ def _start(
     axes = np.asarray(shape.semi_axes) if isinstance(shape, Ellipsoid) else of_moments
     vector[-surface.harmonics.shape[1] :] = ellipsoid_harmonics(surface, axes)
     return vector
-
-
-def _logits(axes: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
-    """Logits of the ratios b/a and c/b."""
-    ratios = np.clip(axes[1:] / axes[:-1], _LEAST_RATIO, 1 - _LEAST_RATIO)
-    return np.log(ratios / (1 - ratios))
 
 
 def _moved(motion: Float[Array, "11"], task: Task, readings: Readings) -> Placed:

@@ -45,6 +45,7 @@ from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin_search import (
     COARSE_DEGREE,
     COARSE_FACETS,
+    REFINED,
     SEARCHED_FACETS,
     STRIDE,
     Spins,
@@ -62,6 +63,10 @@ _MOST_DEGREE = 12
 # orbit tells.
 _NEAR_MIRROR = 0.6
 _SAME_TURNS = 0.3
+_FULL = (
+    "The table is full, so that other rotations may explain the curves, too. Search a "
+    "part of the range of periods at a time."
+)
 # Within a curve the phase function is nearly constant, as is the factor that a relative
 # curve leaves open.
 _NEEDS_SCALE = ("amplitude", "width", "slope")
@@ -485,6 +490,8 @@ def _report(found: SpinInversion) -> str:
         lines.append(
             f"The next solution has a chi-square that is larger by {grown:.0f}."
         )
+    elif len(found.solutions) >= REFINED:
+        lines.append(_FULL)
     lines.append(
         "Errors assume that those of the points are independent and that the body is "
         "convex; the errors of poles in use are often several times larger."

@@ -21,7 +21,7 @@ from jrigid.photometry._convex import (
     spin_quadratic,
     unpacked_convex,
 )
-from jrigid.photometry._periodogram import unlike
+from jrigid.photometry._periodogram import shared_places, unlike
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
 from jrigid.photometry._refine import Quadratic, damped_step
@@ -47,12 +47,15 @@ _SURVIVORS = 96
 _COARSE_STEPS = 40
 _FINALISTS = 24
 _FULL_STEPS = 25
-_BEST = 12
+REFINED = 12
 _LAST_STEPS = 200
 # Solutions are one if their turns within the span differ by less than this, and their
 # poles by less than a quarter of a radian.
 _APART = 0.3
 _APART_IN_POLE = 0.25
+# A period has many poles. It takes no more than this part of the places while there are
+# other periods, so that it does not hide them.
+_SHARE = 1 / 3
 _COARSE_LANES = 32
 # A processor gains nothing by more lanes of the full body at once, and all lanes wait
 # for the slowest.
@@ -135,7 +138,7 @@ def search_spins(
     finalists = best(better, _FINALISTS)
     numbers = _lifted(finalists.numbers, surface)
     full = minimise(numbers, finalists.frames, searched, readings, _FULL_STEPS, _LANES)
-    full = best(full, _BEST)
+    full = best(full, REFINED)
     return settled(full, surface, readings)
 
 
@@ -189,10 +192,15 @@ def best(spins: Spins, count: int) -> Spins:
     """The best points, unlike in their periods or their poles."""
     chi_square = spins.quadratic.chi_square
     spins = spins.rows(np.flatnonzero(np.isfinite(chi_square)))
+    chi_square = spins.quadratic.chi_square
+    turns = spins.numbers[:, 0]
     # In this scale one threshold serves the turns and the poles.
     poles = spins.poles() * _APART / _APART_IN_POLE
-    places = np.column_stack([spins.numbers[:, 0], poles])
-    return spins.rows(unlike(places, -spins.quadratic.chi_square, _APART, count))
+    places = np.column_stack([turns, poles])
+    every = unlike(places, -chi_square, _APART, len(turns))
+    first = shared_places(turns[:, None], every, _APART, int(np.ceil(_SHARE * count)))
+    chosen = [*first, *(i for i in every if i not in first)][:count]
+    return spins.rows(sorted(chosen, key=lambda i: chi_square[i]))
 
 
 def minimise(

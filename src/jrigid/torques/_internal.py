@@ -106,7 +106,8 @@ class Rotor(AbstractTorque):
         momentum: h, relative to the body, body components [kg m^2/s]: an array, or
             `h(t) -> (3,)`. It must be continuous and have a derivative: at a step the
             torque is infinite, and the recoil of the body is missed. A rotor that is
-            switched on in an instant is a `Sampled` with two times a millisecond apart.
+            switched on in an instant is a `Sampled` with four times a millisecond
+            apart, two on each side: its slopes at a time come from the neighbours.
 
     Raises:
         ValueError: The momentum is a `Sampled` with a step.
