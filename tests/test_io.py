@@ -1178,3 +1178,32 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match=r'needs trimesh: pip install "jrigid\[io\]"'):
         jr.io.read_mesh("box.stl")
+
+
+def test_objects_of_an_obj_have_densities_of_their_own(tmp_path):
+    lines = []
+    for count, name in enumerate("AB"):
+        box = trimesh.creation.box((1, 2, 3))
+        box.apply_translation((5.0 * count, 0, 0))
+        lines.append(f"o {name}")
+        lines += ["v " + " ".join(map(str, x)) for x in box.vertices]
+        lines += ["f " + " ".join(map(str, x + 1 + 8 * count)) for x in box.faces]
+    path = tmp_path / "two.obj"
+    path.write_text("\n".join(lines) + "\n")
+    assert float(jr.io.read_mesh(path, 2.0).mass) == pytest.approx(24.0)
+    both = jr.io.read_mesh(path, {"A": 1.0, "B": 3.0})
+    assert float(both.mass) == pytest.approx(24.0)
+    assert_allclose(both.center_of_mass, [3.75, 0, 0], atol=1e-12)
+    with pytest.raises(ValueError, match="'B'"):
+        jr.io.read_mesh(path, {"A": 1.0})
+
+
+def test_a_format_that_needs_another_package_says_so(tmp_path, monkeypatch):
+    def load_scene(*_, **__):
+        raise ModuleNotFoundError("No module named 'cascadio'")
+
+    path = tmp_path / "part.step"
+    path.write_text("ISO-10303-21;")
+    monkeypatch.setattr(trimesh, "load_scene", load_scene)
+    with pytest.raises(ImportError, match=r"part\.step.*trimesh needs.*cascadio"):
+        jr.io.read_mesh(path)

@@ -144,6 +144,47 @@ def test_the_loss_of_the_truth_is_one(rng):
     assert abs(learnt.validation[0] - 1) < 0.08
 
 
+def test_the_gradient_of_a_torque_far_from_the_true_one_is_that_of_the_loss(rng):
+    """Without the drag a segment bends away from its samples; its state moves far."""
+    moments = jnp.array([1.0, 1.7, 2.3])
+    truth = jr.RigidBody(moments, jr.torques.LinearDrag(jnp.asarray(0.2)))
+    ts = jnp.linspace(0.0, 10.0, 100)
+    trials = []
+    for _ in range(3):
+        start = jr.State(ATTITUDE, jnp.asarray(rng.normal(size=3)))
+        omega = np.asarray(jr.simulate(truth, start, ts).states.omega)
+        omega = omega + 0.005 * rng.normal(size=omega.shape)
+        trials.append(identify.Rates(ts, omega, 0.005))
+    seen = []
+
+    def update(slope, memory, params=None):
+        leaves = jax.tree_util.tree_leaves(slope)
+        jax.debug.callback(lambda x: seen.append(float(x)), *leaves)
+        return jax.tree_util.tree_map(jnp.zeros_like, slope), memory
+
+    still = optax.GradientTransformation(lambda _: (), update)
+
+    def loss(drag):
+        body = jr.RigidBody(moments, jr.torques.LinearDrag(jnp.asarray(drag)))
+        options = {"key": jax.random.key(0), "epochs": 1, "batch": 4}
+        result = identify.train(
+            body,
+            trials,
+            still,
+            free=lambda body: body.torque.coefficient,
+            **options,
+        )
+        return float(result.training[0])
+
+    loss(1e-3)
+    jax.effects_barrier()
+    slope = np.mean(seen)
+    step = 1e-5
+    expected = (loss(1e-3 + step) - loss(1e-3 - step)) / (2 * step)
+    assert slope == pytest.approx(expected, rel=1e-3)
+    assert abs(slope) > 100
+
+
 def test_bad_arguments_are_named(scene, untyped):
     train, body = scene.train, scene.body
     key = jax.random.key(0)

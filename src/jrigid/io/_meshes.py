@@ -156,7 +156,8 @@ def read_mesh(
 
     Args:
         path: The file.
-        density: Of all parts, or of each by its name in the file [kg/m^3].
+        density: Of all parts, or of each by its name in the file [kg/m^3]. Parts of an
+            OBJ are its objects, of one material each; its groups are not.
         scale: Metres in a unit of the file. STL, OBJ and PLY do not say their unit, CAD
             programs mean millimetres (1e-3); glTF is in metres, its y axis up.
 
@@ -164,7 +165,8 @@ def read_mesh(
         The body, in the coordinates of the file, in metres.
 
     Raises:
-        ImportError: Without the extra `jrigid[io]`.
+        ImportError: Without the extra `jrigid[io]`, or without what trimesh needs for a
+            format, as for STEP.
         ValueError: No such file, a file that is cut off or of another format than its
             suffix says, or an error as in `from_trimesh`.
 
@@ -180,10 +182,17 @@ def read_mesh(
     file = repr(str(path))
     is_file = Path(path).is_file()
     demand(is_file, f"Argument `path` must be a file, but {file} is none.")
+    options = {}
+    if isinstance(density, Mapping) and Path(path).suffix.lower() == ".obj":
+        # Otherwise trimesh joins objects of the same material to one part.
+        options = {"split_objects": True, "group_material": False}
     try:
-        scene = trimesh.load_scene(path)
-    except ImportError:  # a package that trimesh needs for this format
-        raise
+        scene = trimesh.load_scene(path, **options)
+    except ImportError as error:
+        raise ImportError(
+            f"File {file} cannot be read without a package that trimesh needs for its "
+            f"format: {error}."
+        ) from error
     except Exception as error:  # trimesh raises many types for files that are cut off
         cause = f"{type(error).__name__}: {error}"
         raise ValueError(f"File {file} cannot be read as a mesh. ({cause})") from error

@@ -181,7 +181,8 @@ def log_evidence(alias: Alias, growth: float, width: float) -> float:
     densities = Numbers(
         cycles=np.full(2, -np.log(width)),
         angles=np.full(2, -np.log(2 * np.pi)),
-        pole=np.array([0.0, np.log(np.cos(numbers.pole[1]))]),
+        # A fit may pass a pole of its axes, beyond which the cosine is negative.
+        pole=np.array([0.0, np.log(np.abs(np.cos(numbers.pole[1])))]),
         log_tangent=np.zeros(1),
         shape=slopes[0],
         inertia=slopes[1],

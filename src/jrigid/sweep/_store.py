@@ -118,7 +118,8 @@ def _identity_of(path: Path) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(
             "Argument `store` must be a new directory or one that a sweep has "
-            f"written, but {path} is not. (Choose another, or remove it.)"
+            f"written, but {path} is not, or its zarr.json is damaged. (Restore that "
+            "file to keep what was computed. Else choose another directory.)"
         ) from error
 
 
