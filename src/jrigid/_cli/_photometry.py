@@ -53,9 +53,10 @@ def add_command(commands: Any) -> argparse.ArgumentParser:
         help="periods and tumblers that explain light curves",
         description="Pairs of periods that may explain light curves, in seconds; or "
         "with --report the tumbling ellipsoids that do, in minutes.",
-        epilog=f"Exit status with --report: {_DETERMINED} one tumbler explains the "
-        f"curves, {_SEVERAL} several do, {_MISFIT} none was found; 1 for a file or a "
-        "value that cannot be used, 2 for arguments that cannot be read.",
+        epilog=f"Exit status with --report: {_DETERMINED} one pair of periods and one "
+        "mode explain the curves (the report says how many directions of the angular "
+        f"momentum do), {_SEVERAL} several do, {_MISFIT} none was found; 1 for a file "
+        "or a value that cannot be used, 2 for arguments that cannot be read.",
     )
     command.add_argument(
         "path",

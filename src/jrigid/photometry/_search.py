@@ -129,8 +129,8 @@ def search(
         found += _from_candidates(readings, candidates, mode, _few(_MANY_STARTS))
     # A search keeps few points of one motion, and would miss other poles.
     best = _unlike_periods(_joined(found), _FROM_ALL_POLES)
-    least = best.quadratic.chi_square[0]
-    best = _chosen(best, best.quadratic.chi_square < _MUCH_WORSE * least)
+    growth = best.quadratic.chi_square / best.quadratic.chi_square[0]
+    best = _chosen(best, np.flatnonzero(growth < _MUCH_WORSE))
     for mode in modes:
         cycles = best.numbers[best.tasks.mode == mode, :2]
         found += _from_all_poles(readings, cycles, mode)
