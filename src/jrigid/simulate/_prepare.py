@@ -45,11 +45,10 @@ _RATE_BITS = 16
 _SAVED = 1e-2
 _TOO_FEW_STEPS = (
     "The maximum number of solver steps is too small for the fastest rate at the start "
-    "[rad/s] and the radians requested. (Closed forms cost no more for more turns: "
-    "`jrigid.free_rotation` of a free body, `jrigid.top_motion` of a symmetric top. "
-    "A torque that jumps at the state, like `sign` of a rate that is 0, takes steps "
-    "without end: see `torques.CoulombFriction`. Else check the units, shorten `ts` or "
-    "pass a larger `max_steps`.)"
+    "[rad/s] and the radians requested. (More turns cost no more by "
+    "`jrigid.free_rotation` of a free body or `jrigid.top_motion`. A torque that jumps "
+    "at the state, like `sign` of a rate of 0, needs `torques.CoulombFriction`. Else "
+    "check the units, or pass a larger `max_steps`.)"
 )
 
 
