@@ -1,6 +1,7 @@
 """Inversion of light curves: tumblers made by other code are found."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -550,10 +551,21 @@ def test_a_period_is_written_whatever_its_error(error):
 
 
 def test_places_are_shared_between_groups_of_near_ones():
-    turns = np.array([[1.0], [1.1], [5.0], [1.2], [5.1], [9.0]])
-    order = [0, 1, 3, 2, 4, 5]
-    assert periodogram.shared_places(turns, order, 0.3, 1) == [0, 2, 5]
-    assert periodogram.shared_places(turns, order, 0.3, 2) == [0, 1, 2, 4, 5]
+    turns = np.array([1.0, 1.1, 5.0, 1.2, 5.1, 9.0])
+    # All are apart by another number.
+    places = np.column_stack([turns, np.arange(6.0)])
+    merits = -np.array([0.0, 1.0, 3.0, 2.0, 4.0, 5.0])
+    shared = functools.partial(periodogram.shared_places, places, turns, merits, 0.3)
+    assert shared(3, 1) == [0, 2, 5]
+    assert shared(5, 2) == [0, 1, 2, 4, 5]
+    # What other groups leave is filled, and all are in the order of their merits.
+    assert shared(6, 1) == [0, 1, 3, 2, 4, 5]
+    # A place that is taken is not given again.
+    assert periodogram.shared_places(turns[:, None], turns, merits, 0.3, 6, 2) == [
+        0,
+        2,
+        5,
+    ]
 
 
 def test_the_best_rotations_of_a_search_are_not_those_of_one_period_alone():

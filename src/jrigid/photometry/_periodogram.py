@@ -210,22 +210,38 @@ def unlike(
 
 
 def shared_places(
-    places: Float[np.ndarray, "many n"], order: list[int], apart: float, most: int
+    places: Float[np.ndarray, "many n"],
+    groups: Float[np.ndarray, " many"],
+    merits: Float[np.ndarray, " many"],
+    apart: float,
+    count: int,
+    most: int,
 ) -> list[int]:
-    """Indices in their order, of which at most so many are not apart from one another.
+    """As `unlike`, with at most so many of one group while there are other groups.
 
     Args:
         places: Where each index is.
-        order: Some of the indices, the best first.
+        groups: Those within `apart` of each other are one group.
+        merits: The largest is the best.
         apart: Distance from which places are apart, along one axis at least.
-        most: How many may be near each other.
+        count: How many are chosen.
+        most: How many of them may be of one group.
     """
     chosen: list[int] = []
-    for index in order:
-        gaps = np.abs(places[index] - places[chosen]).max(axis=1)
-        if np.count_nonzero(gaps <= apart) < most:
-            chosen.append(index)
-    return chosen
+    spare: list[int] = []  # of groups that have their share
+    for index in np.argsort(-merits):
+        gaps = np.abs(places[index] - places[chosen + spare]).max(axis=1)
+        if np.any(gaps <= apart):
+            continue
+        near = np.abs(groups[index] - groups[chosen]) <= apart
+        if np.count_nonzero(near) < most:
+            chosen.append(int(index))
+        elif len(spare) < count:
+            spare.append(int(index))
+        if len(chosen) == count:
+            break
+    kept = [*chosen, *spare][:count]
+    return sorted(kept, key=lambda index: -merits[index])
 
 
 def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:

@@ -21,7 +21,7 @@ from jrigid.photometry._convex import (
     spin_quadratic,
     unpacked_convex,
 )
-from jrigid.photometry._periodogram import shared_places, unlike
+from jrigid.photometry._periodogram import shared_places
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
 from jrigid.photometry._refine import Quadratic, damped_step
@@ -192,15 +192,13 @@ def best(spins: Spins, count: int) -> Spins:
     """The best points, unlike in their periods or their poles."""
     chi_square = spins.quadratic.chi_square
     spins = spins.rows(np.flatnonzero(np.isfinite(chi_square)))
-    chi_square = spins.quadratic.chi_square
     turns = spins.numbers[:, 0]
     # In this scale one threshold serves the turns and the poles.
     poles = spins.poles() * _APART / _APART_IN_POLE
     places = np.column_stack([turns, poles])
-    every = unlike(places, -chi_square, _APART, len(turns))
-    first = shared_places(turns[:, None], every, _APART, int(np.ceil(_SHARE * count)))
-    chosen = [*first, *(i for i in every if i not in first)][:count]
-    return spins.rows(sorted(chosen, key=lambda i: chi_square[i]))
+    merits = -spins.quadratic.chi_square
+    most = int(np.ceil(_SHARE * count))
+    return spins.rows(shared_places(places, turns, merits, _APART, count, most))
 
 
 def minimise(
