@@ -255,7 +255,8 @@ class FitResult(eqx.Module):
         tell from them; at a bound more than `level` of the intervals hold the truth.
         They ask for small errors: within a few of them the elements of the tensor
         follow the numbers linearly, their covariance is that at the estimate, and the
-        smallest moment is positive.
+        smallest moment is positive. Of a pure spin no ratio is known, and both limits
+        are NaN.
 
         Args:
             function: Of the tensor. Compiled once for each function, not for each
@@ -283,11 +284,13 @@ class FitResult(eqx.Module):
         # As an array: a Python number would be static, and each level would compile
         # anew.
         level_ = jnp.asarray(level, self.numbers.dtype)
-        return interval(function, self.inertia, self.inertia_covariance, level_)
+        limits = interval(function, self.inertia, self.inertia_covariance, level_)
+        # Then the estimate follows the noise, and what surrounds it says nothing.
+        return jnp.where(self.diagnostics.pure_spin, jnp.nan, limits)
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
-        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first."""
+        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first; see `interval`."""
         # The index is an array of a pytree, so that both ratios share one compiled
         # program.
         ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]

@@ -660,6 +660,6 @@ def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
         settings=requests[0].settings._replace(steps=np.asarray(0))
     )
     padded = [*requests, *[idle] * (lanes - len(requests))]
-    stacked = jtu.tree_map(lambda *x: np.stack([np.asarray(y) for y in x]), *padded)
+    stacked = jtu.tree_map(lambda *x: np.array([np.asarray(y) for y in x]), *padded)
     results = jtu.tree_map(np.asarray, minimise(*stacked))
     return [jtu.tree_map(lambda x, i=i: x[i], results) for i in range(len(requests))]
