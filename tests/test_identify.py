@@ -297,6 +297,20 @@ def test_what_the_samples_do_not_tell_shows_in_the_singular_values():
         np.testing.assert_allclose(found.inertia, RATIOS, atol=1e-6)
 
 
+def test_one_window_gives_a_tensor_that_obeys_its_equations(free_samples):
+    """It has three equations for six numbers, so that many tensors do."""
+    _, omegas = free_samples
+    found = identify.weak_form(TS, omegas, windows=1, radians=20.0)
+    values = np.asarray(found.singular_values)
+    np.testing.assert_array_equal(values[3:], 0.0)
+    seen, nothing = np.ones(len(TS), bool), np.zeros_like(omegas)
+    rows = starts._weak_rows(1, 20.0, TS, seen, omegas, nothing, nothing)
+    tensor = np.asarray(found.inertia)
+    six = np.concatenate([np.diag(tensor), tensor[[0, 0, 1], [1, 2, 2]]])
+    size = np.linalg.norm(rows[:, :6]) * np.linalg.norm(six)
+    assert np.linalg.norm(rows[:, :6] @ six) < 1e-12 * size
+
+
 def test_starts_under_jit_vmap_and_derivatives(free_samples, wheel_samples, rng):
     attitudes, omegas = free_samples
     turned, wheel = wheel_samples

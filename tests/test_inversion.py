@@ -324,6 +324,10 @@ def test_neighbours_of_a_principal_axis_rotation_have_no_second_frequency():
     near = search._neighbours(np.array([[7.0, 0.0]]), model.Mode.principal_axis)
     np.testing.assert_array_equal(near, [[6.5, 0.0], [7.0, 0.0], [7.5, 0.0]])
     assert len(search._neighbours(np.array([[7.0, 3.0]]), model.Mode.long_axis)) == 9
+    # No frequency is zero or negative.
+    near = search._neighbours(np.array([[3.0, 0.5]]), model.Mode.short_axis)
+    assert len(near) == 6
+    assert near.min() == 0.5
 
 
 def test_a_report_says_where_a_body_is_round_about_the_axis_it_circles(inversion):
@@ -420,6 +424,9 @@ def test_calibrated_curves_of_a_plan_share_a_factor_of_the_chosen_ones(inversion
     lost = dataclasses.replace(curves[0], to_sun=0 * curves[0].to_sun)
     with pytest.raises(ValueError, match="Curve 0 of `curves` must have finite times"):
         several.separation([lost], 0.02)
+    dark = dataclasses.replace(curves[0], to_sun=-2 * curves[0].to_observer)
+    with pytest.raises(ValueError, match="Sun is straight behind it"):
+        several.separation([dark], 0.02)
 
 
 def test_few_points_have_candidates_by_constant_coefficients(inversion):

@@ -46,6 +46,16 @@ def rates(ts=RECORD.times, values=RECORD.omegas, sigma=RECORD.sigma):
     return jr.identify.Rates(ts, values, sigma)
 
 
+def two_trials(*torques, **options):
+    """Fit of two trials, each with a body under a torque of its own."""
+    bodies = [jr.RigidBody(MOMENTS, torque) for torque in torques]
+    return jr.identify.fit(bodies, [rates(), rates()], **options)
+
+
+def wheel(size):
+    return jr.torques.Rotor(lambda t: size * t * OMEGA)
+
+
 def forced(torque):
     return jr.simulate(jr.RigidBody(MOMENTS, torque), STATE, TS)
 
@@ -82,6 +92,20 @@ simulate, fit, mesh = jr.simulate, jr.identify.fit, jr.from_mesh
 
 # What a new user writes, and what must be said.
 MISTAKES = {
+    "bodies of two kinds": (
+        lambda: two_trials(jr.torques.LinearDrag(0.1), jr.torques.QuadraticDrag(0.1)),
+        "hold bodies for all trials that differ in floating point arrays alone",
+    ),
+    "wheels by two functions": (
+        lambda: two_trials(wheel(1), wheel(2), scale="rotor"),
+        "their torques, or functions in them, differ",
+    ),
+    "many fits of two kinds": (
+        lambda: jr.identify.fit_each(
+            [BLIND, jr.RigidBody(MOMENTS, jr.torques.LinearDrag(0.1))], [rates()] * 2
+        ),
+        "must be of one kind for all fits, .*: call `fit` for each",
+    ),
     # arguments
     "a state's two arrays swapped": (
         lambda: simulate(BODY, jr.State(OMEGA, UPRIGHT), TS),

@@ -645,6 +645,10 @@ def test_codes_and_numbers_are_classes_and_others_are_refused():
     assert found.to_xarray()["classes"].flag_meanings.split()[2] == "chaotic"
     with pytest.raises(ValueError, match="`refine` must return one"):
         quiet(lambda x, y: x - y, axes, refine=lambda value: value)
+    with pytest.raises(ValueError, match=r"Use `jax.numpy` in `refine`, not .*`int`"):
+        quiet(lambda x, y: x - y, axes, refine=lambda value: int(value > 0))
+    with pytest.raises(ValueError, match=r"`jnp.where` .* in the function of a sweep"):
+        quiet(lambda x, y: x if y > 0 else y, axes)
     with pytest.raises(ValueError, match="`refine` is for a grid"):
         quiet(jnp.sin, points=np.ones(3), refine=lambda value: value > 0)
 

@@ -1,3 +1,7 @@
+# ruff: noqa: ARG002
+
+# Systems and torques have arguments that some of them do not use.
+
 import diffrax
 import equinox as eqx
 import jax
@@ -197,6 +201,131 @@ def test_a_body_without_torque_is_free():
     assert jr.RigidBody(MOMENTS, tq.Sum([])).is_free
     assert not swinging(MOMENTS).is_free
     assert isinstance(jr.RigidBody(MOMENTS), jr.AbstractSystem)
+
+
+class Wheels(tq.AbstractTorque):
+    """Two parts that turn at constant rates and push nothing."""
+
+    def __call__(self, t, state, args):
+        return jnp.zeros(3)
+
+    def internal_at_rest(self, state):
+        return (jnp.zeros(2, int),)
+
+    def internal_rate(self, t, state, args):
+        return (jnp.array([0.3, 0.7]),)
+
+    def internal_scale(self, rate):
+        return (rate,)
+
+
+class OfAnotherShape(Wheels):
+    def internal_rate(self, t, state, args):
+        return (jnp.zeros(3),)
+
+
+class WithoutRate(Wheels):
+    def internal_rate(self, t, state, args):
+        return ()
+
+
+class WithoutScale(Wheels):
+    def internal_scale(self, rate):
+        return ()
+
+
+STILL = jr.State(ATTITUDE, OMEGA)
+
+
+def test_parts_whose_numbers_at_rest_are_integers_move():
+    motion = jr.simulate(jr.RigidBody(MOMENTS, Wheels()), STILL, 1.0)
+    np.testing.assert_allclose(motion.final_state.internal[0], [0.3, 0.7], rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("torque", "message"),
+    [
+        (OfAnotherShape(), r"`internal_rate` .* shapes \[\(2,\)\], .* \[\(3,\)\]"),
+        (WithoutRate(), r"`internal_rate` .* shapes \[\(2,\)\], .* \[\]"),
+        (WithoutScale(), "`internal_scale` .* of 1 arrays, .* of 0"),
+    ],
+)
+def test_methods_of_a_torque_that_disagree_on_its_parts_are_an_error(torque, message):
+    with pytest.raises(ValueError, match=message):
+        jr.simulate(jr.RigidBody(MOMENTS, torque), STILL, 1.0)
+
+
+class Slider(jr.AbstractSystem):
+    """A body with a mass that slides on a spring along its first axis, at a height.
+
+    Its torque is `Slide`, which states the two coordinates of the mass.
+    """
+
+    state_type = jr.State
+    inertia: jax.Array
+    torque: tq.AbstractTorque
+    mass: float
+    height: float
+    stiffness: float
+
+    def moving(self, state):
+        """Position and velocity of the mass, and the velocity in the body's axes."""
+        place, speed = state.internal
+        position = jnp.stack([place, 0.0 * place, self.height + 0.0 * place])
+        along = speed * jnp.array([1.0, 0.0, 0.0])
+        return position, jnp.cross(state.omega, position) + along, along
+
+    def vector_field(self, t, state, args):
+        """By Newton's second law for the mass, and the angular momentum of the rest."""
+        position, _, along = self.moving(state)
+        omega, axis = state.omega, jnp.array([1.0, 0.0, 0.0])
+        apparent = jnp.cross(omega, jnp.cross(omega, position))
+        apparent += 2 * jnp.cross(omega, along)
+        arm = jnp.cross(position, axis)
+        square = jnp.sum(position**2) * jnp.eye(3)
+        square -= position[:, None] * position[None]
+        left = jnp.diag(self.inertia) + self.mass * square
+        corner = jnp.full((1, 1), self.mass)
+        side = self.mass * arm
+        matrix = jnp.block([[left, side[:, None]], [side, corner]])
+        turning = -jnp.cross(omega, self.inertia * omega)
+        turning -= self.mass * jnp.cross(position, apparent)
+        pull = -self.stiffness * position[:1] - self.mass * apparent[:1]
+        change = jnp.linalg.solve(matrix, jnp.concatenate([turning, pull]))
+        attitude = ro.attitude_rate(state.attitude, omega)
+        return jr.State(attitude, change[:3], (along[0], change[3]))
+
+    def energy(self, t, state, args):
+        position, velocity, _ = self.moving(state)
+        turning = jnp.sum(self.inertia * state.omega**2)
+        moving = self.mass * jnp.sum(velocity**2)
+        return (turning + moving + self.stiffness * position[0] ** 2) / 2
+
+    def angular_momentum(self, t, state, args):
+        position, velocity, _ = self.moving(state)
+        momentum = self.inertia * state.omega
+        momentum += self.mass * jnp.cross(position, velocity)
+        return ro.rotate(state.attitude, momentum)
+
+
+class Slide(Wheels):
+    def internal_at_rest(self, state):
+        return (jnp.zeros(()), jnp.zeros(()))
+
+    def internal_scale(self, rate):
+        return (jnp.ones_like(rate), rate)
+
+
+def test_a_system_of_ones_own_with_coordinates_of_its_own():
+    """Its torque states them, as the documentation of `AbstractSystem` says."""
+    system = Slider(jnp.asarray(MOMENTS), Slide(), mass=0.3, height=0.7, stiffness=2.0)
+    state = jr.State(ATTITUDE, OMEGA, (jnp.array(0.1), jnp.array(0.0)))
+    motion = jr.simulate(system, state, np.linspace(0.0, 20.0, 5), rtol=1e-10)
+    place, _ = motion.states.internal
+    assert np.ptp(place) > 0.1
+    np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=1e-8)
+    momentum = np.asarray(motion.angular_momentum)
+    np.testing.assert_allclose(momentum, np.tile(momentum[0], (5, 1)), atol=1e-8)
 
 
 def test_a_state_without_its_parts_is_an_error_that_says_how_to_add_them():

@@ -45,6 +45,12 @@ _State = TypeVar("_State", bound=BodyState)
 class AbstractSystem(Readable):
     """A system for `jrigid.simulate`: inertia, torque, vector field and invariants.
 
+    A system of your own has the two attributes and the abstract methods. Coordinates
+    beyond those of `State` are internal parts: its torque states them by
+    `internal_at_rest` and `internal_scale`, and its `vector_field` returns their rates.
+    Only `simulate` takes it. `jrigid.stability` and `jrigid.identify` take a
+    `RigidBody`.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ball = jr.solids.sphere(1.0, 0.1)
     >>> bodies = jr.RigidBody(jnp.ones(3)), jr.FloatingBody(ball)
@@ -88,9 +94,12 @@ class AbstractSystem(Readable):
             The state itself, if it has its parts.
         """
         if state.internal is None:
-            state = dataclasses.replace(
-                state, internal=self.torque.internal_at_rest(state)
+            # Parts move continuously, also those whose numbers at rest are integers.
+            at_rest = jtu.tree_map(
+                lambda x: jnp.asarray(x, state.omega.dtype),
+                self.torque.internal_at_rest(state),
             )
+            state = dataclasses.replace(state, internal=at_rest)
         # Raises an error for wrong parts.
         self._inertia_and_torque(state)
         return state
@@ -139,7 +148,18 @@ class AbstractSystem(Readable):
 def _shapes(tree: PyTree) -> list[tuple[str, tuple[int, ...]]]:
     """Paths and shapes of the leaves of a pytree."""
     leaves = jtu.tree_leaves_with_path(tree)
-    return [(jtu.keystr(path), x.shape) for path, x in leaves]
+    return [(jtu.keystr(path), jnp.shape(x)) for path, x in leaves]
+
+
+def _check_parts(method: str, value: PyTree, state: BodyState) -> None:
+    """Raise ValueError unless a method of a torque answers for each internal part."""
+    have = [shape for _, shape in _shapes(value)]
+    want = [shape for _, shape in _shapes(state.internal)]
+    if have != want:
+        raise ValueError(
+            f"Method `{method}` of a torque must return what `internal_at_rest` does, "
+            f"arrays of the shapes {want}, but it returns {have}."
+        )
 
 
 class FloatingState(Readable):
@@ -224,6 +244,7 @@ class RigidBody(AbstractSystem):
         with traced_by_jax("a torque"):
             acting = torque(t, state, args)
             internal_rate = torque.internal_rate(t, state, args)
+        _check_parts("internal_rate", internal_rate, state)
         return State(
             attitude_rate(state.attitude, state.omega),
             euler_equations(inertia, state.omega, acting),

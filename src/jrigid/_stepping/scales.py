@@ -127,12 +127,21 @@ def spread(
         length: Scale of the position of a body in flight [m].
         speed: Scale of its velocity [m/s].
     """
+    of_parts = internal_parts(system.torque.internal_scale(rate))
+    have = jtu.tree_structure(of_parts)
+    want = jtu.tree_structure(state.internal)
+    if have != want:
+        raise ValueError(
+            "Method `internal_scale` of a torque must return a tuple as that of "
+            f"`internal_at_rest`, of {want.num_leaves} arrays, but it returns one of "
+            f"{have.num_leaves}."
+        )
     scale: dict[str, PyTree[Array]] = {
         "position": length,
         "velocity": speed,
         "attitude": jnp.ones_like(rate),
         "omega": rate,
-        "internal": internal_parts(system.torque.internal_scale(rate)),
+        "internal": of_parts,
     }
     full = {
         name: jtu.tree_map(jnp.full_like, value, scale[name])

@@ -366,7 +366,8 @@ def ellipeinc(
         E to 8 ulps, NaN outside the domain. Arguments broadcast.
 
     Gradients: closed forms in R_D, to any order, right at m = 0 and m = 1; at m = 1
-    -inf with respect to m beyond |phi| = pi/2.
+    -inf with respect to m beyond |phi| = pi/2. There forward mode gives NaN also with
+    respect to phi where both are varied, since it multiplies that infinity by zero.
     Source: DLMF 19.2.5, 19.25.9-19.25.11.
 
     >>> import jrigid.elliptic

@@ -38,6 +38,7 @@ from jrigid.identify._result import (
     LARGEST_ERROR,
     Status,
     errors_of,
+    of_moments,
     sigma_points,
     spread_of,
 )
@@ -165,13 +166,6 @@ def _errors_of_axes(
     return np.sqrt(np.maximum(square, 0.0))
 
 
-def _of_moments(moments: np.ndarray) -> np.ndarray:
-    """Moments, ratios and shares (..., 8)."""
-    total = np.sum(moments, axis=-1, keepdims=True)
-    ratios = moments[..., 1:] / moments[..., :1]
-    return np.concatenate([moments, ratios, moments / total], axis=-1)
-
-
 def _spread_of_moments(
     problem: Problem, numbers: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
@@ -187,7 +181,7 @@ def _spread_of_moments(
     tensors = np.asarray(tensors_at(problem.unknowns, points))
     if not np.all(np.isfinite(tensors)):
         return unknown
-    return spread_of(_of_moments(np.linalg.eigvalsh(tensors)), scales)
+    return spread_of(of_moments(np.linalg.eigvalsh(tensors)), scales)
 
 
 def _at_least_probed(
@@ -199,11 +193,11 @@ def _at_least_probed(
     derivative, and the covariance, know nothing of that. A probe is a body
     some standard errors away, so that no moment or ratio may be off by more of its own.
     """
-    estimate = _of_moments(moments)
+    estimate = of_moments(moments)
     errors = errors_of(spread)
     factors = np.ones_like(errors)
     for probe in probes:
-        move = np.abs(_of_moments(np.linalg.eigvalsh(probe.tensor)) - estimate)
+        move = np.abs(of_moments(np.linalg.eigvalsh(probe.tensor)) - estimate)
         error = move / probe.distance
         # What is known exactly has no error, and no probe moves it beyond rounding.
         ratio = error / np.where(errors > 0, errors, np.inf)

@@ -75,7 +75,7 @@ from jrigid.identify._search import (
 )
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
-from jrigid.identify._unknowns import Unknowns, unknowns_of
+from jrigid.identify._unknowns import Unknowns, are_alike, unknowns_of
 from jrigid.systems import RigidBody
 
 # Radians of a segment, of free motion and of forced.
@@ -275,6 +275,15 @@ def fit_each(
         _task(question, bodies[id(body)], observed, first)
         for body, observed, first in zip(systems, observations, starts, strict=True)
     ]
+    kinds = [
+        (x.systems[0], *(y.sensor for y in x.records), x.options.motion) for x in tasks
+    ]
+    demand(
+        are_alike(kinds),
+        "Arguments `system`, `observations` and `start` must be of one kind for all "
+        "fits, but torques, sensors, functions in them or states of internal parts "
+        "differ: call `fit` for each.",
+    )
     return _side_by_side(_fits(tasks, Effort(max_steps, doublings), throw))
 
 
@@ -553,10 +562,13 @@ def _observed(
     if readings is not None and not any(tells(x, "rates") for x in records):
         alias = other_way_round(readings)
     if readings is not None and alias is not None and state is not None:
-        # The initial state says which of the two motions it was.
+        # The initial state says which of the two motions it was. The first rows of a
+        # trial may be no readings.
         first = state.omega
-        off = np.sum((readings.omega[:, 0] - first) ** 2)
-        off_alias = np.sum((alias.omega[:, 0] - first) ** 2)
+        seen = np.argmax(readings.valid, axis=1)
+        at = np.arange(seen.size), seen
+        off = np.sum((readings.omega[at] - first) ** 2)
+        off_alias = np.sum((alias.omega[at] - first) ** 2)
         readings = alias if off_alias < off else readings
         alias = None
     rate = typical_rate(readings, state, samples.ts.dtype)
@@ -838,7 +850,15 @@ def _side_by_side(results: Sequence[dict[str, Any]]) -> FitResult:
     """One result with an axis of fits in front, from the fields of each."""
     columns = zip(*map(arrays_of, results), strict=True)
     stacked = jax.device_put([np.stack(x) for x in columns])
-    return jtu.tree_structure(result_of(results[0])).unflatten(stacked)
+    # Each record chose its steps and jumps. The largest numbers do for all.
+    options = [x["problem"].options for x in results]
+    steps = max(x.steps for x in options)
+    jumps = max(x.jumps for x in options)
+    problem = dataclasses.replace(
+        results[0]["problem"], options=options[0]._replace(steps=steps, jumps=jumps)
+    )
+    one = result_of(results[0] | {"problem": problem})
+    return jtu.tree_structure(one).unflatten(stacked)
 
 
 def _lengths(records: tuple[Record, ...]) -> list[int]:

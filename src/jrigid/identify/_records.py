@@ -30,7 +30,7 @@ Noise = Real[_ArrayLike, "..."] | None
 class Record(Readable):
     """Times, values and noise of one sensor, in one trial or in several.
 
-    NaN, or an entry that numpy masks, stands for "not seen". It may stand in a
+    NaN, infinity, or an entry that numpy masks, stands for "not seen". It may stand in a
     component of `values`, in a whole row, or in `ts` and its row (padding, which brings
     trials to one length). Then that number is left out, or the whole sample where its
     components belong together: in attitudes, in directions and beside a `covariance`.

@@ -293,7 +293,7 @@ class FitResult(eqx.Module):
         """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first; see `interval`."""
         # The index is an array of a pytree, so that both ratios share one compiled
         # program.
-        ratios = [jtu.Partial(_of_moments, jnp.asarray(i)) for i in (3, 4)]
+        ratios = [jtu.Partial(_one_of_moments, jnp.asarray(i)) for i in (3, 4)]
         return jnp.stack([self.interval(x) for x in ratios], axis=1)
 
     @property
@@ -623,11 +623,17 @@ def _predicted(result: FitResult, ts: Array, record: int, trial: Array) -> Array
     return as_read(sensor, shown)
 
 
-def _of_moments(which: Any, tensor: Array) -> Array:
-    """Some of the moments, ratios and shares of a tensor."""
-    moments = eigh(tensor)[0]
-    ratios = moments[1:] / moments[0]
-    return jnp.concatenate([moments, ratios, moments / jnp.sum(moments)])[which]
+def of_moments(moments: AnyArray) -> AnyArray:
+    """Moments, ratios and shares (..., 8)."""
+    xp = moments.__array_namespace__()
+    total = xp.sum(moments, axis=-1, keepdims=True)
+    ratios = moments[..., 1:] / moments[..., :1]
+    return xp.concatenate([moments, ratios, moments / total], axis=-1)
+
+
+def _one_of_moments(which: Array, tensor: Array) -> Array:
+    """One of the moments, ratios and shares of a tensor."""
+    return of_moments(eigh(tensor)[0])[which]
 
 
 def _spread(

@@ -471,7 +471,11 @@ def search(case: Case) -> Search:
             weak = other_weak
         index += 1
     if case.alias is not None and (wrong > 0 or not ambiguous):
+        read = best
         best, rival = yield from _beside_alias(case.alias, best)
+        if best is not read:
+            # Probes begin where this fit began.
+            case = case.alias
         ambiguous = ambiguous or rival
         wrong = misfit(best)
         weak = weakest(best)

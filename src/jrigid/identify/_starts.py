@@ -227,6 +227,10 @@ def _answer(
 
 def _null_vector(rows: Array) -> tuple[Array, Array]:
     """Of unit trace; and the singular values."""
+    # A single window has fewer equations than unknowns, and without more rows no null
+    # vector among those of the decomposition.
+    missing = max(rows.shape[1] - rows.shape[0], 0)
+    rows = jnp.pad(rows, ((0, missing), (0, 0)))
     size = or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows))))
     _, values, right = jnp.linalg.svd(rows / size, full_matrices=False)
     trace = jnp.sum(right[-1, :3])

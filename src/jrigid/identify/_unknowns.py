@@ -259,12 +259,12 @@ def _arrays_of(
     arrays, rest = eqx.partition(parts, eqx.is_inexact_array)
     paths_and_values, structure = jtu.tree_flatten_with_path(arrays)
     paths = [path for path, _ in paths_and_values]
-    of_trials = [_float_leaves((system, *sensors)) for system in systems]
     demand(
-        all(len(leaves) == len(paths) for leaves in of_trials),
-        "Argument `system` must hold bodies of the same kind for all trials, but it "
-        "does not.",
+        are_alike(systems),
+        "Argument `system` must hold bodies for all trials that differ in floating "
+        "point arrays alone, but their torques, or functions in them, differ.",
     )
+    of_trials = [_float_leaves((system, *sensors)) for system in systems]
     leaves = []
     stacked = []
     for values in zip(*of_trials, strict=True):
@@ -281,6 +281,12 @@ def _arrays_of(
         leaves=leaves,
         stacked=tuple(stacked),
     )
+
+
+def are_alike(parts: Sequence[Any]) -> bool:
+    """Whether pytrees differ in floating point arrays alone."""
+    first, *others = (eqx.filter(x, eqx.is_inexact_array, inverse=True) for x in parts)
+    return all(bool(eqx.tree_equal(x, first)) for x in others)
 
 
 def _float_leaves(parts: tuple[Any, ...]) -> list[AnyArray]:
@@ -457,40 +463,23 @@ class Unknowns(eqx.Module):
     def start(
         self, tensor: AnyArray, flattest: AnyArray | float = 1e-3
     ) -> tuple["Unknowns", AnyArray]:
-        """Initial numbers for a tensor, for which the model's frame is chosen."""
-        unknowns, numbers = self.starts(tensor[None], [flattest])
-        return unknowns, numbers[0]
-
-    def starts(
-        self, tensors: AnyArray, flattest: Sequence[AnyArray | float]
-    ) -> tuple["Unknowns", AnyArray]:
-        """Initial numbers for several tensors.
+        """Initial numbers for a tensor, for which the model's frame is chosen.
 
         Args:
-            tensors: The tensors (n, 3, 3); the model's frame is chosen for the first.
-            flattest: For each, the least second moment of the body to start from.
-
-        Returns:
-            Unknowns with the model in that frame, and numbers (n, numbers).
+            tensor: The tensor.
+            flattest: The least second moment of the body to start from.
         """
-        xp = tensors.__array_namespace__()
-        known = self.known_tensor.astype(tensors.dtype)
-        starts = [
-            self.inertia_model.start(tensor, known, least)
-            for tensor, least in zip(tensors, flattest, strict=True)
-        ]
-        # The number of the scale is the logarithm of a factor of the trace that was
-        # given.
-        factors = xp.trace(tensors, axis1=1, axis2=2) / self.trace
-        scales = xp.log(xp.where(factors > 0, factors, 1.0))
-        others = [x.start() for x in self.shared]
-        rows = []
-        for (_, of_model), scale in zip(starts, scales, strict=True):
-            of_scale = scale[None] if self.scaled else scale[None][:0]
-            parts = [of_model, of_scale, *others]
-            rows.append(xp.concatenate([xp.asarray(x, tensors.dtype) for x in parts]))
-        first_model, _ = starts[0]
-        return dataclasses.replace(self, inertia_model=first_model), xp.stack(rows)
+        xp = tensor.__array_namespace__()
+        known = self.known_tensor.astype(tensor.dtype)
+        model, of_model = self.inertia_model.start(tensor, known, flattest)
+        parts = [of_model]
+        if self.scaled:
+            # The logarithm of a factor of the trace that was given.
+            factor = xp.trace(tensor) / self.trace
+            parts.append(xp.log(xp.where(factor > 0, factor, 1.0))[None])
+        parts += [x.start() for x in self.shared]
+        numbers = xp.concatenate([xp.asarray(x, tensor.dtype) for x in parts])
+        return dataclasses.replace(self, inertia_model=model), numbers
 
     def own_start(self, trials: int, dtype: DTypeLike) -> AnyArray:
         """Initial numbers of each trial (trials, own)."""

@@ -113,7 +113,10 @@ def _index_array(faces: AnyArray) -> AnyArray:
         raise ValueError(
             "Argument `faces` must hold at least one face, but it is empty."
         )
-    return faces.astype(np.int32) if isinstance(faces, np.ndarray) else faces
+    if isinstance(faces, np.ndarray):
+        # A larger index stays one that no vertex has.
+        return np.clip(faces, -1, np.iinfo(np.int32).max).astype(np.int32)
+    return faces
 
 
 def _triple_product(a: list[Array], b: list[Array], c: list[Array]) -> Array:

@@ -50,6 +50,8 @@ _IS_THIN = (
     "   an ellipsoid as thin as no known body: the curves are few for its shape, and the "
     "errors mean little"
 )
+# How many of the solutions that do not count as aliases are kept.
+_REJECTED = 5
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -265,11 +267,10 @@ def _inversion(
     # A stated noise may be too small, and the errors grow with the misfit. It is never
     # reduced.
     scale = max(reduced, 1.0) if stated else reduced
-    every = []
-    for numbers, task in zip(found.numbers, tasks, strict=True):
-        every.append(alias_of(numbers, task, readings, scale))
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
+    points = list(zip(found.numbers, tasks, strict=True))[: near + _REJECTED]
+    every = [alias_of(numbers, task, readings, scale) for numbers, task in points]
     mirror = index_of_mirror(readings, found)
     if mirror is not None and mirror >= near:
         mirror = None
@@ -281,7 +282,7 @@ def _inversion(
     noise = readings.typical_noise()
     return Inversion(
         aliases=aliases,
-        rejected=every[near : near + 5],
+        rejected=every[near:],
         epoch=epoch,
         noise=noise if stated else noise * np.sqrt(reduced),
         reduced_chi_square=reduced if stated else 1.0,

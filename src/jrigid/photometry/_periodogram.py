@@ -115,7 +115,8 @@ def period_pairs(
     readings, _ = readings_of(curves, noise=0.01)
     span = float(readings.span)
     lowest, highest = cycles_within(span, shortest, longest)
-    pairs, powers = frequency_pairs(readings, lowest, highest, count)
+    lines, _ = strongest_lines(readings, lowest, highest)
+    pairs, powers = frequency_pairs(readings, lines, lowest, highest, count)
     explained = powers / float(np.sum(readings.values**2))
     return PeriodPairs(span / pairs[:, 0], span / pairs[:, 1], explained)
 
@@ -157,10 +158,21 @@ def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, 
 
 
 def frequency_pairs(
-    readings: Readings, lowest: float, highest: float, count: int
+    readings: Readings,
+    lines: Float[np.ndarray, " lines"],
+    lowest: float,
+    highest: float,
+    count: int,
 ) -> tuple[Float[np.ndarray, "pairs 2"], Float[np.ndarray, " pairs"]]:
-    """Pairs of frequencies, in cycles within the span, and chi-square they explain."""
-    lines, _ = strongest_lines(readings, lowest, highest)
+    """Pairs of frequencies, in cycles within the span, and chi-square they explain.
+
+    Args:
+        readings: The light curves.
+        lines: Lines of their periodogram, each of which a pair has.
+        lowest: Lowest frequency [cycles within the span].
+        highest: Highest frequency.
+        count: How many pairs are returned.
+    """
     step = 1 / _OVERSAMPLING
     rotation = np.arange(max(lowest, _LEAST_CYCLES), highest, step)
     rows = []
@@ -199,14 +211,8 @@ def unlike(
     count: int,
 ) -> list[int]:
     """Indices of the places of most merit that are apart from all better ones."""
-    chosen: list[int] = []
-    for index in np.argsort(-merits):
-        gaps = np.abs(places[index] - places[chosen]).max(axis=1)
-        if np.all(gaps > apart):
-            chosen.append(int(index))
-        if len(chosen) == count:
-            break
-    return chosen
+    one_group = np.zeros(len(merits))
+    return shared_places(places, one_group, merits, apart, count, count)
 
 
 def shared_places(

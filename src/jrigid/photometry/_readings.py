@@ -18,6 +18,9 @@ EPOCHS = 128  # arrays are filled up to whole blocks of epochs
 _FACTORS = 16  # and of unknown factors
 # Of a column of the basis, in the epochs that were chosen; its size in all is 1.
 _LEAST_SIZE = 1e-9
+# Of the sum of the unit vectors to the Sun and the observer, which is zero where the
+# body shows its dark side.
+_LEAST_LIT = 1e-6
 # Standard deviations of chi-square, and of a correlation, that are no chance.
 _SURE = 4.0
 
@@ -165,6 +168,12 @@ def _check_curves(curves: Sequence[LightCurve]) -> None:
             and bool(np.all(np.isfinite(lengths) & (lengths > 0))),
             f"Curve {index} of `curves` must have finite times and vectors other than 0, "
             "but it has not.",
+        )
+        sums = _unit(vectors[0]) + _unit(vectors[1])
+        demand(
+            bool(np.all(np.linalg.norm(sums, axis=1) > _LEAST_LIT)),
+            f"Curve {index} of `curves` must show a body that is lit, but at a point the "
+            "Sun is straight behind it: are both vectors from the body?",
         )
     # A body of some metres has brightness of this size, too, but hardly in every curve.
     demand(

@@ -106,7 +106,9 @@ class Mixture(AbstractScattering):
     """Lommel-Seeliger's law with a part of Lambert's, and a phase function.
 
     mu0 mu (1 / (mu0 + mu) + lambert) (1 + amplitude exp(-alpha / width) + slope alpha),
-    where alpha is the phase angle. It is the law of DAMIT's models.
+    where alpha is the phase angle. It is the law of DAMIT's models, for the phase
+    angles from which its parameters were found: a negative slope makes the brightness
+    negative beyond alpha = -1 / slope.
 
     Attributes:
         lambert: Weight of Lambert's law.

@@ -104,8 +104,10 @@ def search(
     Raises:
         ValueError: No candidate is a motion of these modes.
     """
-    cycles, _ = frequency_pairs(readings, lowest, highest, pairs)
     lines, _ = strongest_lines(readings, lowest, highest)
+    cycles = np.zeros((0, 2))
+    if modes != [Mode.principal_axis]:
+        cycles, _ = frequency_pairs(readings, lines, lowest, highest, pairs)
     found = []
     for mode in modes:
         if mode == Mode.principal_axis:
@@ -188,12 +190,14 @@ def _reflection(readings: Readings) -> Float[np.ndarray, "3 3"]:
 
 
 def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
-    """Candidates with frequencies half a cycle to each side."""
+    """Candidates with frequencies half a cycle to each side, but none below zero."""
     either = (-0.5, 0.0, 0.5)
     # A principal-axis rotation has no second frequency.
     second = (0.0,) if mode == Mode.principal_axis else either
     beside = np.array([(x, y) for x in either for y in second])
-    return (candidates[:, None] + beside).reshape(-1, 2)
+    moved = (candidates[:, None] + beside).reshape(-1, 2)
+    sought = moved[:, :1] if mode == Mode.principal_axis else moved
+    return moved[np.all(sought > 0, axis=1)]
 
 
 def _from_candidates(

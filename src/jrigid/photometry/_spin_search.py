@@ -136,7 +136,9 @@ def search_spins(
         better.numbers, better.frames, coarse, few, _COARSE_STEPS, _COARSE_LANES
     )
     finalists = best(better, _FINALISTS)
-    numbers = _lifted(finalists.numbers, surface)
+    # Harmonics are in the order of their degrees: those of the coarse body come first.
+    finer = surface.centre.size - finalists.numbers.shape[1]
+    numbers = np.pad(finalists.numbers, ((0, 0), (0, finer)))
     full = minimise(numbers, finalists.frames, searched, readings, _FULL_STEPS, _LANES)
     full = best(full, REFINED)
     return settled(full, surface, readings)
@@ -163,16 +165,6 @@ def starts(
     numbers = np.tile(first, (count * _POLES, 1))
     numbers[:, 0] = np.repeat(cycles, _POLES)
     return numbers, np.tile(frames, (count, 1, 1))
-
-
-def _lifted(
-    numbers: Float[np.ndarray, "many coarse"], surface: Surface
-) -> Float[np.ndarray, "many numbers"]:
-    """Numbers of a coarse body as those of a finer one."""
-    # Harmonics are in the order of their degrees: those of the coarse body come first.
-    lifted = np.zeros((len(numbers), surface.centre.size))
-    lifted[:, : numbers.shape[1]] = numbers
-    return lifted
 
 
 def mirrored(spins: Spins) -> tuple[AnyArray, AnyArray]:

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from jrigid._checks import traced_by_jax
 from jrigid._core.third_party import EnumerationItem, enumeration_of, names_of
 from jrigid.sweep._grid import Grid
 from jrigid.sweep._result import Failure, SweepResult
@@ -42,7 +43,8 @@ def _classes(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return classes of values that have axes of this shape in front, and names."""
     flat = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[len(shape) :]), values)
-    classes = classify(flat)
+    with traced_by_jax("`refine`"):
+        classes = classify(flat)
     leaves = jtu.tree_leaves(classes)
     if len(leaves) != 1 or leaves[0].ndim != 1 or leaves[0].dtype.kind not in "iub":
         raise ValueError(

@@ -15,6 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from jrigid._checks import traced_by_jax
 from jrigid.sweep._grid import Grid, Leaf, on_block
 from jrigid.sweep._store import Memory, Store, fingerprint
 
@@ -138,7 +139,8 @@ def traced(
     blocks.
     """
     one = jtu.tree_map(lambda x: x[:1], part)
-    jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, names, one)
+    with traced_by_jax("the function of a sweep"):
+        jaxpr, (values, _), _ = eqx.filter_make_jaxpr(evaluated)(function, names, one)
     return values, fingerprint(function, jaxpr)
 
 

@@ -273,7 +273,10 @@ class AbstractTorque(Readable):
         return None
 
     def internal_at_rest(self, state: BodyState) -> tuple[PyTree, ...]:
-        """Internal state of parts that move with the body; `()` if there are none."""
+        """Internal state of parts that move with the body; `()` if there are none.
+
+        A torque that has some also has `internal_rate` and `internal_scale`.
+        """
         return ()
 
     def internal_rate(
