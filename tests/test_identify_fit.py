@@ -464,7 +464,7 @@ def test_many_fits_name_their_numbers_once_and_other_methods_ask_for_one_fit():
         lambda: identify.compare({"both": both}),
     ]
     for ask in asked:
-        with pytest.raises(ValueError, match=r"must be a single fit, .* \(2,\) fits"):
+        with pytest.raises(ValueError, match=r"of a single fit here, .* \(2,\) fits"):
             ask()
 
 

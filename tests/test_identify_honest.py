@@ -279,6 +279,40 @@ def test_flat_bodies_are_not_told_to_be_unknown_beside_sharp_ratios(rng):
             assert not any("I3/I1" in x for x in found.null_directions), text
 
 
+def test_the_largest_moment_of_a_body_that_looks_flat_has_its_error(rng):
+    """The estimate of a body that is half an error thick is flat in one of two fits.
+
+    The errors of flat estimates are those of the others, whose rows know the thickness.
+    """
+    moments = 3 * np.array([0.6, 0.9, 1.4994]) / 2.9994
+    _, rates = seen(rng, np.diag(moments), sigma=0.0)
+    records = [
+        identify.Rates(TS, rates + 0.02 * rng.normal(size=rates.shape), 0.02)
+        for _ in range(12)
+    ]
+    found = identify.fit_each(BLIND, records)
+    errors = np.asarray(found.moments_errors)
+    off = np.asarray(found.moments) - moments
+    assert np.all(np.abs(off) < 4.5 * errors)
+    flat = np.asarray(found.status == Status.AT_BOUNDARY)
+    assert 0 < np.sum(flat) < 12
+    size = np.median(errors[~flat, 2])
+    assert np.all(errors[flat, 2] > 0.5 * size)
+    assert np.all(errors[flat, 2] < 2.0 * size)
+
+
+def test_moments_by_a_few_samples_are_not_stated_to_ten_digits(rng):
+    """Estimates end at flat bodies and rods, whose largest moment is half the trace."""
+    ts = np.arange(8) * 0.02
+    motion = worlds.tumble(np.diag([1.0, 1.7, 2.2]), np.array([2.0, 6.0, 1.0]), ts)
+    true = 3 * np.array([1.0, 1.7, 2.2]) / 4.9
+    for _ in range(6):
+        values = motion.omega + 0.02 * rng.normal(size=motion.omega.shape)
+        found = fitted(values, 0.02, ts, throw=False)
+        off = np.asarray(found.moments) - true
+        assert np.all(np.abs(off) < 5 * np.asarray(found.moments_errors)), str(found)
+
+
 # The noise that was stated, or not
 
 

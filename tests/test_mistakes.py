@@ -4,6 +4,7 @@ docs/gotchas.md."""
 
 # Users write out the arguments of a lambda, used or not.
 
+import functools
 import io
 import math
 import re
@@ -56,6 +57,11 @@ def wheel(size):
     return jr.torques.Rotor(lambda t: size * t * OMEGA)
 
 
+@functools.cache
+def found_once():
+    return jr.identify.fit(BLIND, rates())
+
+
 def forced(torque):
     return jr.simulate(jr.RigidBody(MOMENTS, torque), STATE, TS)
 
@@ -99,6 +105,24 @@ MISTAKES = {
     "wheels by two functions": (
         lambda: two_trials(wheel(1), wheel(2), scale="rotor"),
         "their torques, or functions in them, differ",
+    ),
+    "a profile of three numbers": (
+        lambda: jr.identify.profile(found_once(), jnp.diagonal, [1.0]),
+        r"`function` must return .* 0 axes, but it returns one of shape \(3,\)",
+    ),
+    "a position of a sampler without the states": (
+        lambda: jr.identify.log_density(found_once()).function(found_once().numbers),
+        r"`position` must have shape \(8,\), but it has shape \(5,\)",
+    ),
+    "a prior without width": (
+        lambda: fit(BLIND, rates(), free=lambda _, x: jr.identify.prior(x.bias, 0.0)),
+        "`sigma` of a prior must be positive, but it is 0.0",
+    ),
+    "axes in two units": (
+        lambda: jr.records.read(
+            io.StringIO("t [s],wx [deg/s],wy [rad/s],wz\n1,2,3,4\n")
+        ),
+        r"`unit` must say the unit of `rates`, .* deg/s and rad/s for axes of one",
     ),
     "many fits of two kinds": (
         lambda: jr.identify.fit_each(

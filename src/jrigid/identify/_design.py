@@ -14,7 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import INERTIA, check_shape, check_type, demand, nan_where
+from jrigid._checks import (
+    INERTIA,
+    all_finite,
+    check_shape,
+    check_type,
+    demand,
+    nan_where,
+)
 from jrigid._core.compile import Static, program, small_jit
 from jrigid._numerics import as_tensor, or_one, product
 from jrigid._types import AnyArray, Matrix, Readable, Real, Scalar
@@ -42,7 +49,7 @@ from jrigid.identify._records import (
     of_trials,
     samples_of,
 )
-from jrigid.identify._result import FitResult, demand_single, result_of
+from jrigid.identify._result import FitResult, check_rank, demand_single, result_of
 from jrigid.identify._search import ACCURACY, Request, minima
 from jrigid.identify._smoother import Links, Point, Rows
 from jrigid.identify._unknowns import Unknowns, unknowns_of
@@ -292,6 +299,9 @@ def _bound(planned: _Planned) -> Bound:
     unknowns = planned.problem.unknowns
     numbers = planned.minimum.point.numbers
     root = _inverse_root(_jacobian(planned.minimum))
+    # Readings that are not finite count as not seen: without a motion none is.
+    point = planned.minimum.point
+    root = jnp.where(all_finite((point.attitude, point.omega)), root, jnp.nan)
 
     def ratios(numbers: Array) -> Array:
         moments = jnp.linalg.eigvalsh(unknowns.inertia(numbers))
@@ -391,7 +401,7 @@ def profile(
         Growth of chi-square, in units of the noise; NaN where no fit was found.
 
     Raises:
-        ValueError: The fit has an unmodelled torque.
+        ValueError: The fit has an unmodelled torque, or the function returns no scalar.
 
     Gradients: not reliable.
 
@@ -408,6 +418,7 @@ def profile(
     [1. 0. 1.]
     """
     demand_single(result)
+    check_rank(function, result.inertia, 0)
     values = jnp.asarray(values, result.numbers.dtype)
     check_shape("values", values, (None,))
     demand(

@@ -46,6 +46,8 @@ from jrigid.identify._smoother import Rows
 from jrigid.identify._torque_errors import added_by_torque, fields_of_torque
 
 HISTORY = 512  # steps whose sums of squares are returned
+# Names of the fields of `derive` that state errors end so.
+_OF_ERRORS = ("_covariance", "_errors")
 _FEWEST = 8  # trials whose scatter says how large errors are
 # Scatter of trials over the errors stated, above which something is missing.
 _DISAGREEING = 3.0
@@ -223,6 +225,8 @@ def conclude(
     judgement = _judgement(fit, known, _white(fit, independent))
     numbers = fit.minimum.point.numbers
     derived = derive(fit.problem, numbers, judgement.covariance, fit.probes)
+    if fit.thicker is not None:
+        derived |= _errors_of(fit.thicker, judgement.remainder.inflation, derived)
     of_torque = fields_of_torque(fit, judgement.remainder.inflation)
     fields = derived | of_torque
     fields |= _fields_of_judgement(judgement)
@@ -238,6 +242,25 @@ def conclude(
     fields = _of_dtype(fields, good, fit.minimum.units.dtype)
     status = _status(judgement.status, good, error, derived, of_torque)
     return fields | {"status": getattr(Status, status), "input_result": input_result}
+
+
+def _errors_of(
+    thicker: Fit, inflation: float, thin: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Errors of what is derived from the tensor, by the rows of a thicker body.
+
+    Args:
+        thicker: Those rows.
+        inflation: Of the variances.
+        thin: The same errors by the rows of the estimate. Its ratios may be huge, and
+            so are their errors.
+    """
+    known = precision(thicker)
+    covariance = _inflated(thicker, known, np.ones_like(known.values), inflation)
+    derived = derive(thicker.problem, thicker.minimum.point.numbers, covariance, ())
+    if np.trace(thin["ratios_covariance"]) > np.trace(derived["ratios_covariance"]):
+        derived["ratios_covariance"] = thin["ratios_covariance"]
+    return {name: x for name, x in derived.items() if name.endswith(_OF_ERRORS)}
 
 
 def _white(fit: Fit, independent: Independent) -> np.ndarray:

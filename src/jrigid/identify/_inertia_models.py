@@ -20,6 +20,8 @@ from jrigid.mass import MassProperties, inertia_of_second_moment
 LOG_CHOLESKY = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 # Second moments of the mass, over their trace, below which a fit is at a boundary.
 BOUNDARY = 1e-7
+# Which numbers of a `Tensor` are logarithms.
+LOGARITHMS = slice(2)
 
 
 def real_body(tensor: AnyArray, flattest: ScalarLike) -> AnyArray:

@@ -59,6 +59,8 @@ class Fit:
         history: Sums of squares after each step of all stages.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
         probes: Bodies along the weakest direction, within six standard errors.
+        thicker: Of a body at the boundary of real ones, the rows of a thicker body,
+            where all errors can be seen. None for others.
         computed: Values of functions marked `once_for_each_fit`, by function.
     """
 
@@ -72,6 +74,7 @@ class Fit:
     history: np.ndarray
     ambiguous: bool = False
     probes: tuple[Probe, ...] = ()
+    thicker: "Fit | None" = None
     computed: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property

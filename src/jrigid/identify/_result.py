@@ -241,7 +241,7 @@ class FitResult(eqx.Module):
             function: Of the tensor.
         """
         demand_single(self)
-        _check_rank(function, self.inertia, 1)
+        check_rank(function, self.inertia, 1)
         return _spread(self.unknowns, self.numbers, self.numbers_covariance, function)
 
     def interval(
@@ -276,7 +276,7 @@ class FitResult(eqx.Module):
         [0.44 0.44]
         """
         demand_single(self)
-        _check_rank(function, self.inertia, 0)
+        check_rank(function, self.inertia, 0)
         demand(
             not is_concrete(level) or 0 < level < 1,
             f"Argument `level` must be above 0 and below 1, but it is {level}.",
@@ -585,8 +585,8 @@ def demand_single(result: FitResult) -> None:
     shape = result.numbers.shape[:-1]
     demand(
         not shape,
-        f"Argument `result` must be a single fit, but it holds {shape} fits: take one "
-        "by `jax.tree.map(lambda x: x[0], result)`.",
+        f"A result must be that of a single fit here, but it holds {shape} fits: take "
+        "one by `jax.tree.map(lambda x: x[0], result)`.",
     )
 
 
@@ -598,7 +598,7 @@ def _check_index(name: str, value: Int[_ArrayLike, ""], count: int) -> None:
     )
 
 
-def _check_rank(function: Callable[[Array], Any], tensor: Array, rank: int) -> None:
+def check_rank(function: Callable[[Array], Any], tensor: Array, rank: int) -> None:
     """Raise ValueError unless a function of the tensor returns an array of a rank."""
     value = jax.eval_shape(function, tensor)
     shape = getattr(value, "shape", None)

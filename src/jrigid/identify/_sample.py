@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jrigid._checks import demand
+from jrigid._checks import check_shape, demand
 from jrigid._numerics import product
 from jrigid._types import Scalar
 from jrigid.dynamics import State
@@ -147,7 +147,12 @@ def log_density(result: FitResult) -> LogDensity:
     samples = jnp.where(result.kept, 1.0, 0.0) / result.diagnostics.inflation
     weight = jnp.pad(samples, ((0, 0), (0, priors)), constant_values=1.0)
 
+    no_change = jnp.zeros((trials, state_size), result.numbers.dtype)
+    of_trials = jnp.concatenate([no_change, result.own_numbers], axis=1).reshape(-1)
+    start = jnp.concatenate([result.numbers, of_trials])
+
     def function(position: Array) -> Array:
+        check_shape("position", position, (start.size,))
         numbers = position[:size]
         of_trials = position[size:].reshape(trials, state_size + own_size)
         own = of_trials[:, state_size:]
@@ -156,7 +161,4 @@ def log_density(result: FitResult) -> LogDensity:
         chi_square = jnp.sum(weight[..., None] * rows[:, : weight.shape[1]] ** 2)
         return -0.5 * chi_square + _log_jacobian(unknowns, numbers, own)
 
-    no_change = jnp.zeros((trials, state_size), result.numbers.dtype)
-    of_trials = jnp.concatenate([no_change, result.own_numbers], axis=1).reshape(-1)
-    start = jnp.concatenate([result.numbers, of_trials])
     return LogDensity(function, start, result.covariance)

@@ -20,6 +20,7 @@ from jrigid._types import AnyArray
 from jrigid.identify import _levels as levels
 from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
 from jrigid.identify._errors import Weakest, weakest
+from jrigid.identify._inertia_models import LOGARITHMS, Tensor
 from jrigid.identify._layout import Layout
 from jrigid.identify._minimise import (
     FIRST_DAMPING,
@@ -29,6 +30,7 @@ from jrigid.identify._minimise import (
     minimise,
     tensors_at,
 )
+from jrigid.identify._precision import precision
 from jrigid.identify._problem import Problem
 from jrigid.identify._quality import (
     FOLLOWED,
@@ -69,6 +71,12 @@ _LEVELS = 12
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
+# Logarithms of elements of L of a body that is thicker than flat: the first one tried,
+# the thickest and the thinnest.
+_FIRST_THICKNESS = -3.5
+_THICKEST = -1.5
+_THINNEST = -8.0
+_VAGUE = 3.0  # an error of such a logarithm that is more than a factor of size
 _FLAT = 1e-3  # least second moment of the body that the first attempt starts from
 _ROUND = 0.1  # ... that others start from, since the first led nowhere
 _FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
@@ -484,7 +492,48 @@ def search(case: Case) -> Search:
         # Squares beside levels of their own differ, so fits with a level are not
         # probed.
         best = yield from _probed(case, best, weak)
+    if _is_thickness_unknown(best):
+        thicker = yield from _thicker(case, best)
+        best = dataclasses.replace(best, thicker=thicker)
     return best
+
+
+def _is_thickness_unknown(best: Fit) -> bool:
+    """Whether the mass may lie in a plane or on a line for all that is known."""
+    if not isinstance(best.problem.unknowns.inertia_model, Tensor):
+        return False
+    logarithms = best.minimum.point.numbers[LOGARITHMS]
+    variances = np.diagonal(precision(best).covariance)[LOGARITHMS]
+    is_thin = (logarithms < _FIRST_THICKNESS) & (variances > _VAGUE**2)
+    return is_at_boundary(best) or bool(np.any(is_thin))
+
+
+def _thicker(case: Case, best: Fit) -> Search:
+    """The rows of a body as thick as its thickness is uncertain.
+
+    The numbers of a body are logarithms. Those that state the thickness of a flat one
+    change nothing to first order, so that its own rows say nothing of their errors.
+    """
+    # The first step evaluates the point, and moves nothing.
+    stage = stages_of(case, slow=False)[-1]._replace(steps=1)
+    settings = _settings(stage, best.kept, best.scales, best.disturbance)
+    problem, point = _in_own_frame(best.problem, best.minimum.point)
+    fit = best
+    least = _FIRST_THICKNESS
+    # The first time tells the size of the error.
+    for _ in range(2):
+        numbers = point.numbers.copy()
+        numbers[LOGARITHMS] = np.maximum(numbers[LOGARITHMS], least)
+        at = point._replace(numbers=numbers)
+        minimum = yield Request(problem, best.layout, at, settings)
+        fit = dataclasses.replace(
+            best, problem=problem, minimum=minimum, probes=(), computed={}
+        )
+        variances = np.diagonal(precision(fit).covariance)[LOGARITHMS]
+        # A second moment is the square of an element of L.
+        error = 2 * np.sqrt(np.max(variances))
+        least = np.clip(least + 0.5 * np.log(error), _THINNEST, _THICKEST)
+    return fit
 
 
 def _beside_alias(

@@ -61,6 +61,9 @@ def prior(array: PyTree, sigma: Real[ArrayLike, "..."]) -> PyTree:
         array: What is sought, an array or several in a pytree.
         sigma: One standard deviation, in the unit of the array.
 
+    Raises:
+        ValueError: A sigma that is not positive.
+
     >>> import jax.numpy as jnp, jrigid as jr
     >>> record = jr.datasets.gyro_example()
     >>> readings = jr.identify.Rates(record.times, record.omegas, record.sigma)
@@ -70,6 +73,10 @@ def prior(array: PyTree, sigma: Real[ArrayLike, "..."]) -> PyTree:
     >>> print(result.names[5:])
     ('gyro.bias[0]', 'gyro.bias[1]', 'gyro.bias[2]')
     """
+    demand(
+        not is_concrete(sigma) or bool(np.all(np.asarray(sigma) > 0)),
+        f"Argument `sigma` of a prior must be positive, but it is {sigma}.",
+    )
     return jtu.tree_map(lambda x: dataclasses.replace(x, sigma=sigma), array)
 
 

@@ -93,13 +93,21 @@ class _Units(NamedTuple):
     ) -> float | None:
         """The factor to SI from the caller, the file or the numbers, else None."""
         table = sensor.table
-        # The first column has the times. The first axis speaks for all three.
-        column = sensor.columns[0 if kind == "times" else 1]
-        _, unit = _split(table.headers[column])
+        # The first column has the times. One axis speaks for all three.
+        columns = sensor.columns[:1] if kind == "times" else sensor.columns[1:]
+        column = columns[0]
+        stated = {_split(table.headers[j])[1] for j in columns} - {None}
+        unit = next(iter(stated), None)
         scale = table.scales.get(column, 1.0)
         what = f"{kind.replace('_', ' ')} ({_label(kind, sensor)})"
         if unit == "counts":
             turned = ""  # gravity tells rad/s from deg/s alone
+        demand(
+            kind in self.asked or len({_UNITS[kind].get(x, x) for x in stated}) < 2,
+            f"Argument `unit` must say the unit of `{kind}`, but it does not, and the "
+            f"file states {' and '.join(sorted(map(str, stated)))} for axes of one "
+            "sensor.",
+        )
         if kind in self.asked:
             factor, said = self._as_asked(kind, unit, scale, column in table.sources)
         else:
@@ -231,7 +239,7 @@ def read(
     units = _Units(_asked(unit), [])
     columns = columns or {}
     tables = tables_of(path, log)
-    chosen, main = _chosen(tables, columns)
+    chosen, main = _chosen(tables, columns, units.notes)
     own, raw = _on_one_clock(chosen, main, clock, units)
     measured = _in_si(chosen, raw, own.times, units)
     used = {main.columns[0]}
@@ -246,9 +254,12 @@ def read(
 
 
 def _chosen(
-    tables: list[Table], columns: Columns
+    tables: list[Table], columns: Columns, notes: list[str]
 ) -> tuple[dict[str, _Sensor], _Sensor]:
-    """Choose the sensors to read, by what they measure, and the one with the clock."""
+    """Choose the sensors to read, by what they measure, and the one with the clock.
+
+    Notes say which others are not read.
+    """
     headers = ", ".join(header for table in tables for header in table.headers)
     _rename(tables, columns)
     sensors = [x for table in tables for x in _sensors(table, columns)]
@@ -267,6 +278,14 @@ def _chosen(
     apart = columns.keys() - _UNITS.keys() - set(main.table.headers)
     message = f"must name columns of one file, but {apart} is apart."
     demand(not apart, f"Argument `columns` {message}")
+    for kind, sensor in sensors:
+        read = chosen.get(kind, sensor)
+        if read.table is not sensor.table:
+            what = kind.replace("_", " ")
+            notes.append(
+                f"{what} of {sensor.table.name!r} left out: those of "
+                f"{read.table.name!r} are read"
+            )
     return chosen, main
 
 
