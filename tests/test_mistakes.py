@@ -122,7 +122,7 @@ MISTAKES = {
         lambda: jr.records.read(
             io.StringIO("t [s],wx [deg/s],wy [rad/s],wz\n1,2,3,4\n")
         ),
-        r"`unit` must say the unit of `rates`, .* deg/s and rad/s for axes of one",
+        r"`unit` must say the unit of `rates`, .* deg/s and rad/s for its axes",
     ),
     "many fits of two kinds": (
         lambda: jr.identify.fit_each(

@@ -738,6 +738,18 @@ def test_times_by_name_in_one_file_of_a_folder(tmp_path):
     np.testing.assert_allclose(reading.rates, reading.specific_forces)
 
 
+def test_a_note_names_the_log_of_a_folder_that_is_not_read(tmp_path):
+    for name, rate in (("first", 1), ("second", 2)):
+        rows = "".join(f"{0.01 * i:.2f},{rate},2,3\n" for i in range(5))
+        text = "t (s),gx (rad/s),gy (rad/s),gz (rad/s)\n" + rows
+        (tmp_path / f"{name}.csv").write_text(text)
+    reading = jr.records.read(tmp_path)
+    assert "rates of 'second' left out: those of 'first' are read" in reading.notes
+    np.testing.assert_array_equal(reading.rates[:, 0], 1.0)
+    alone = jr.records.read(tmp_path / "second.csv")
+    assert not any("left out" in x for x in alone.notes)
+
+
 def test_capital_suffixes_and_equal_names(tmp_path):
     """A folder may hold `.CSV`, and folders of an archive files of the same name."""
     gyro = PHYPHOX + "\n" + scientific(ROWS)

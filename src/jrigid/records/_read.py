@@ -94,10 +94,11 @@ class _Units(NamedTuple):
         """The factor to SI from the caller, the file or the numbers, else None."""
         table = sensor.table
         # The first column has the times. One axis speaks for all three.
-        columns = sensor.columns[:1] if kind == "times" else sensor.columns[1:]
+        columns = sensor.columns[:1] if kind == "times" else sensor.columns[1:4]
         column = columns[0]
-        stated = {_split(table.headers[j])[1] for j in columns} - {None}
-        unit = next(iter(stated), None)
+        units = [_split(table.headers[j])[1] for j in columns]
+        stated = [x for x in units if x is not None]
+        unit = stated[0] if stated else None
         scale = table.scales.get(column, 1.0)
         what = f"{kind.replace('_', ' ')} ({_label(kind, sensor)})"
         if unit == "counts":
@@ -105,8 +106,7 @@ class _Units(NamedTuple):
         demand(
             kind in self.asked or len({_UNITS[kind].get(x, x) for x in stated}) < 2,
             f"Argument `unit` must say the unit of `{kind}`, but it does not, and the "
-            f"file states {' and '.join(sorted(map(str, stated)))} for axes of one "
-            "sensor.",
+            f"file states {' and '.join(dict.fromkeys(stated))} for its axes.",
         )
         if kind in self.asked:
             factor, said = self._as_asked(kind, unit, scale, column in table.sources)
