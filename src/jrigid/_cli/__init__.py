@@ -18,7 +18,7 @@ import numpy as np
 from jrigid import identify, plot, records
 from jrigid._checks import demand
 from jrigid._cli import _photometry
-from jrigid._cli._arguments import numbers, output
+from jrigid._cli._arguments import numbers, output, picture
 from jrigid.identify import Status
 from jrigid.systems import RigidBody
 
@@ -145,7 +145,7 @@ def _add_options_of_fit(command: argparse.ArgumentParser) -> None:
     command.add_argument("--robust", action="store_true", help="leave outliers out")
     command.add_argument(
         "--plot",
-        type=output,
+        type=picture,
         metavar="PNG",
         help="where to draw the fit (needs matplotlib)",
     )

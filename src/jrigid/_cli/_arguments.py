@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+_PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".eps")
+
 
 def numbers(text: str) -> list[float]:
     """Numbers between commas; an empty list if one of them is none."""
@@ -22,6 +24,18 @@ def output(text: str) -> str:
         message = f"its folder must exist, but {str(folder)!r} does not"
         raise argparse.ArgumentTypeError(message)
     return text
+
+
+def picture(text: str) -> str:
+    """A file of a picture that can be written, in a format that matplotlib has."""
+    suffix = Path(text).suffix.lower()
+    # A file without a suffix becomes a PNG.
+    if suffix and suffix not in _PICTURES:
+        message = (
+            f"its suffix must be one of {', '.join(_PICTURES)}, but it is {suffix}"
+        )
+        raise argparse.ArgumentTypeError(message)
+    return output(text)
 
 
 def count(text: str) -> int:

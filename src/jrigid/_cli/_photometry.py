@@ -10,7 +10,7 @@ import numpy as np
 
 from jrigid import photometry, plot
 from jrigid._checks import demand
-from jrigid._cli._arguments import count, numbers, output
+from jrigid._cli._arguments import count, numbers, picture
 
 _HOUR = 3600.0
 _DAY = 86400.0
@@ -122,7 +122,7 @@ def _add_options_of_inversion(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--plot",
-        type=output,
+        type=picture,
         metavar="PNG",
         help="with --report, where to draw curves and best tumbler (needs matplotlib)",
     )
