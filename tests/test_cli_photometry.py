@@ -221,6 +221,10 @@ def test_mistakes_are_said_in_a_sentence(
             ["photometry", "a.txt", *PERIODS, "--report", "--plot", "none/a.png"],
             "argument --plot: its folder must exist, but 'none' does not",
         ),
+        (
+            ["photometry", "a.txt", *PERIODS, "--report", "--plot", "a.xyz"],
+            "argument --plot: its suffix must be one of .png, .pdf, ",
+        ),
     ],
 )
 def test_wrong_arguments_are_left_to_argparse(arguments, words, capsys):
