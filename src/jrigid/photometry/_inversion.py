@@ -269,8 +269,8 @@ def _inversion(
     scale = max(reduced, 1.0) if stated else reduced
     growth = (found.quadratic.chi_square - least) / scale
     near = int(np.count_nonzero(growth <= threshold))
-    points = list(zip(found.numbers, tasks, strict=True))[: near + _REJECTED]
-    every = [alias_of(numbers, task, readings, scale) for numbers, task in points]
+    shown = zip(found.numbers[: near + _REJECTED], tasks, strict=False)
+    every = [alias_of(numbers, task, readings, scale) for numbers, task in shown]
     mirror = index_of_mirror(readings, found)
     if mirror is not None and mirror >= near:
         mirror = None
