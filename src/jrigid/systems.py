@@ -153,8 +153,8 @@ def _shapes(tree: PyTree) -> list[tuple[str, tuple[int, ...]]]:
 
 def _check_parts(method: str, value: PyTree, state: BodyState) -> None:
     """Raise ValueError unless a method of a torque answers for each internal part."""
-    have = [shape for _, shape in _shapes(value)]
-    want = [shape for _, shape in _shapes(state.internal)]
+    have = [jnp.shape(x) for x in jtu.tree_leaves(value)]
+    want = [jnp.shape(x) for x in jtu.tree_leaves(state.internal)]
     if have != want:
         raise ValueError(
             f"Method `{method}` of a torque must return what `internal_at_rest` does, "

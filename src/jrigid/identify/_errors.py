@@ -226,7 +226,9 @@ def conclude(
     numbers = fit.minimum.point.numbers
     derived = derive(fit.problem, numbers, judgement.covariance, fit.probes)
     if fit.thicker is not None:
-        derived |= _errors_of(fit.thicker, judgement.remainder.inflation, derived)
+        derived |= _errors_if_thicker(
+            fit.thicker, judgement.remainder.inflation, derived
+        )
     of_torque = fields_of_torque(fit, judgement.remainder.inflation)
     fields = derived | of_torque
     fields |= _fields_of_judgement(judgement)
@@ -244,7 +246,7 @@ def conclude(
     return fields | {"status": getattr(Status, status), "input_result": input_result}
 
 
-def _errors_of(
+def _errors_if_thicker(
     thicker: Fit, inflation: float, thin: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Errors of what is derived from the tensor, by the rows of a thicker body.

@@ -59,8 +59,8 @@ class Fit:
         history: Sums of squares after each step of all stages.
         ambiguous: Whether bodies far from this one describe the record nearly as well.
         probes: Bodies along the weakest direction, within six standard errors.
-        thicker: Of a body at the boundary of real ones, the rows of a thicker body,
-            where all errors can be seen. None for others.
+        thicker: Of a body that may be flat or a rod for all that is known, the rows of
+            a thicker body, which show all errors. None for others.
         computed: Values of functions marked `once_for_each_fit`, by function.
     """
 

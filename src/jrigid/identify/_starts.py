@@ -225,12 +225,17 @@ def _answer(
     return settle(estimate, throw, _findings, padded, *given)
 
 
+def _with_rows(rows: Array, unknowns: int) -> Array:
+    """Equations, and rows of zeros up to as many as there are unknowns.
+
+    A single window has three, and a decomposition of these has no null vectors.
+    """
+    return jnp.pad(rows, ((0, max(unknowns - rows.shape[0], 0)), (0, 0)))
+
+
 def _null_vector(rows: Array) -> tuple[Array, Array]:
     """Of unit trace; and the singular values."""
-    # A single window has fewer equations than unknowns, and without more rows no null
-    # vector among those of the decomposition.
-    missing = max(rows.shape[1] - rows.shape[0], 0)
-    rows = jnp.pad(rows, ((0, missing), (0, 0)))
+    rows = _with_rows(rows, rows.shape[1])
     size = or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows))))
     _, values, right = jnp.linalg.svd(rows / size, full_matrices=False)
     trace = jnp.sum(right[-1, :3])
@@ -398,8 +403,7 @@ def _gyrostat(size: Any, known: Array, ts: Array, omegas: Array, rotor: Array) -
     rows_of_trials = jax.vmap(partial(_weak_rows, *size))
     rows = rows_of_trials(ts, known, omegas, rotor, jnp.zeros_like(rotor))
     rows = rows.reshape(-1, 7)
-    # A single window has fewer equations than unknowns.
-    rows = jnp.pad(rows, ((0, max(6 - rows.shape[0], 0)), (0, 0)))
+    rows = _with_rows(rows, 6)
     rows = rows / or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows[:, :6]))))
     left, values, vt, determined = _singular(rows[:, :6])
     inverse = jnp.where(determined, 1 / jnp.where(determined, values, 1.0), 0.0)

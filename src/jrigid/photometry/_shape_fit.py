@@ -192,8 +192,8 @@ def fit_shape(
             all have them. Else it is what the fit leaves, and a misfit cannot be seen.
         epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
         degree: Largest degree of the harmonics of the areas.
-        facets: Number of facets. The search uses 512 of them at most, the result has
-            all. With too few the stated errors are too small.
+        facets: Number of facets, rounded up to an even one. The search uses 512 of them
+            at most, the result has all. With too few the stated errors are too small.
         scattering: The law, or where its fit starts; `Mixture()` where it is None.
         fitted: Names of parameters of `scattering` that are fitted: "lambert",
             "amplitude", "width", "slope". All but the first need curves that are not

@@ -193,8 +193,9 @@ def find_spin(
         longest: Longest sidereal period [s]. The cost grows with the number of periods,
             2.5 times the span of the curves over `shortest` less that over `longest`.
         degree: Largest degree of the harmonics.
-        facets: Number of facets, rounded up to an even one. The search uses 512 of them at most, the solutions
-            have all. With too few the stated errors are too small.
+        facets: Number of facets, rounded up to an even one. The search uses 512 of them
+            at most, the solutions have all. With too few the stated errors are too
+            small.
         scattering: The law, or where its fit starts; `Mixture()` where it is None.
         fitted: Names of parameters of `scattering` that are fitted: "lambert",
             "amplitude", "width", "slope". All but the first need curves that are not
