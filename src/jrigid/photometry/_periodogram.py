@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import demand
+from jrigid._core.host_rows import in_batches
 from jrigid._numerics import product
 from jrigid._types import Scalar
 from jrigid.photometry._files import LightCurve
@@ -187,7 +188,7 @@ def frequency_pairs(
         "Arguments `shortest` and `longest` must hold a pair of periods of the curves' "
         "strongest lines, but they do not: choose a wider range.",
     )
-    powers = _in_blocks(_SERIES, readings, pairs)
+    powers = _explained(_SERIES, readings, pairs)
     chosen = unlike(pairs, powers, _APART, count)
     return pairs[chosen], powers[chosen]
 
@@ -199,7 +200,7 @@ def strongest_lines(
     step = 1 / _OVERSAMPLING_OF_LINES
     # The line 2 f_phi + 2 f_psi reaches up to four times the highest frequency.
     frequencies = np.arange(2 * max(lowest, 1.0), 4 * highest, step)
-    powers = _in_blocks(_LINE, readings, frequencies[:, None])
+    powers = _explained(_LINE, readings, frequencies[:, None])
     chosen = unlike(frequencies[:, None], powers, _LINES_APART, _LINES)
     return frequencies[chosen], powers[chosen]
 
@@ -274,19 +275,14 @@ def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
     return columns
 
 
-def _in_blocks(
+def _explained(
     series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: np.ndarray
 ) -> Float[np.ndarray, " many"]:
-    """What a series explains for each row of frequencies, by a program of one size."""
+    """What a series explains for each row of frequencies."""
     modulating = modulations(readings)
-    powers = []
-    for first in range(0, len(frequencies), _BLOCK):
-        block = frequencies[first : first + _BLOCK]
-        missing = _BLOCK - len(block)
-        block = np.pad(block, ((0, missing), (0, 0)), mode="edge")
-        values = np.asarray(_powers(series, readings, modulating, block))
-        powers.append(values[: _BLOCK - missing])
-    return np.concatenate(powers)
+    return in_batches(
+        _BLOCK, lambda x: _powers(series, readings, modulating, x), frequencies
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)

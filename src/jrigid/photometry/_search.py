@@ -1,7 +1,7 @@
 """The search for tumblers that explain light curves: candidates, scan, refinement."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import demand
+from jrigid._core.host_rows import in_batches, joined, rows_of
 from jrigid.photometry._model import (
     COUNT,
     Mode,
@@ -68,7 +69,6 @@ _LANES = 16
 # tell.
 _NEAR_MIRROR = 0.6
 
-Tree = TypeVar("Tree")
 # Rows and columns of some of a table of values.
 Choice: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
@@ -120,26 +120,26 @@ def search(
             candidates = cycles
         found += _from_candidates(readings, candidates, mode, _few(_STARTS))
     demand(
-        len(found) > 0,
+        sum(len(points.numbers) for points in found) > 0,
         "Arguments `shortest` and `longest` must hold the periods of a motion of these "
-        "`modes`, but they do not: choose a wider range.",
+        "`modes` that is lit at all epochs, but they do not: choose a wider range.",
     )
     # The best periods are looked at again, from more starting points.
-    best = _unlike_periods(_joined(found), _AGAIN)
+    best = _unlike_periods(joined(found), _AGAIN)
     for mode in modes:
         candidates = _neighbours(best.numbers[best.tasks.mode == mode, :2], mode)
         found += _from_candidates(readings, candidates, mode, _few(_MANY_STARTS))
     # A search keeps few points of one motion, and would miss other poles.
-    best = _unlike_periods(_joined(found), _FROM_ALL_POLES)
+    best = _unlike_periods(joined(found), _FROM_ALL_POLES)
     growth = best.quadratic.chi_square / best.quadratic.chi_square[0]
-    best = _chosen(best, np.flatnonzero(growth < _MUCH_WORSE))
+    best = rows_of(best, np.flatnonzero(growth < _MUCH_WORSE))
     for mode in modes:
         cycles = best.numbers[best.tasks.mode == mode, :2]
         found += _from_all_poles(readings, cycles, mode)
-    joined = _best(_joined(found))
+    best = _best(joined(found))
     if not homogeneous:
-        joined = _with_own_moments(readings, joined)
-    return _best(_joined([joined, _mirrored(readings, joined)]))
+        best = _with_own_moments(readings, best)
+    return _best(joined([best, _mirrored(readings, best)]))
 
 
 def _with_own_moments(readings: Readings, found: Found) -> Found:
@@ -177,7 +177,7 @@ def _mirrored(readings: Readings, found: Found) -> Found:
     an ellipsoid looks the same from opposite sides. Therefore the rotation -M R has the
     light curves of R. Its momentum is -M L. It has the same periods and moments.
     """
-    best = _chosen(found, [0])
+    best = rows_of(found, [0])
     tasks = best.tasks._replace(frame=-best.tasks.frame @ _reflection(readings))
     return _minimised(readings, best.numbers, tasks, _LAST_STEPS)
 
@@ -219,7 +219,7 @@ def _from_all_poles(
         return []
     starts = _starts(readings, numbers, of_candidate, mode, _each_pole)
     parts = np.split(np.arange(len(starts.numbers)), len(np.unique(of_candidate)))
-    return [_refined(readings, _chosen(starts, rows)) for rows in parts]
+    return [_refined(readings, rows_of(starts, rows)) for rows in parts]
 
 
 def _starts(
@@ -233,7 +233,7 @@ def _starts(
     turned = orientations()
     few = fewer_epochs(readings)
     tasks = _tasks(len(numbers), mode, _LOOSE)
-    values = _in_blocks(
+    values = in_batches(
         _LANES_OF_SCAN, lambda x, y: scanned(x, y, turned, few), numbers, tasks
     )
     chosen = []
@@ -243,7 +243,7 @@ def _starts(
         chosen.append(np.stack([rows[row], column], axis=1))
     motion, orientation = np.concatenate(chosen).T
     frames = [frame_of(turned[i]) for i in orientation]
-    tasks = _rows(tasks, motion)._replace(frame=np.array(frames).reshape(-1, 3, 3))
+    tasks = rows_of(tasks, motion)._replace(frame=np.array(frames).reshape(-1, 3, 3))
     at = Quadratic(values[motion, orientation], None, None)
     return Found(numbers[motion], tasks, at)
 
@@ -339,7 +339,7 @@ def _refined(readings: Readings, starts: Found) -> Found:
     for halving in range(_HALVINGS + 1):
         # Points of like frequencies may still go different ways.
         order = np.argsort(found.quadratic.chi_square)
-        found = _chosen(found, order[: _FINALISTS // 2**halving])
+        found = rows_of(found, order[: _FINALISTS // 2**halving])
         found = _minimised(readings, found.numbers, found.tasks, _NEXT_STEPS)
     found = _best(found)
     tasks = found.tasks._replace(link=np.full(len(found.numbers), _TIGHT))
@@ -357,13 +357,13 @@ def _best(found: Found) -> Found:
     poles = poles_of(found) * APART / _APART_IN_POLE
     places = np.column_stack([_motions_of(found), poles])
     merits = -found.quadratic.chi_square
-    return _chosen(found, unlike(places, merits, APART, len(places)))
+    return rows_of(found, unlike(places, merits, APART, len(places)))
 
 
 def _unlike_periods(found: Found, count: int) -> Found:
     """The best points that are unlike in their motions."""
     merits = -found.quadratic.chi_square
-    return _chosen(found, unlike(_motions_of(found), merits, APART, count))
+    return rows_of(found, unlike(_motions_of(found), merits, APART, count))
 
 
 def _minimised(
@@ -371,36 +371,8 @@ def _minimised(
 ) -> Found:
     """The points after so many steps, those that are finite."""
     minimise: Callable[..., tuple[Array, Quadratic]] = refined
-    numbers, quadratic = _in_blocks(
+    numbers, quadratic = in_batches(
         _LANES, lambda x, y: minimise(x, y, readings, steps=steps), numbers, tasks
     )
     found = Found(numbers, tasks, quadratic)
-    return _chosen(found, np.flatnonzero(np.isfinite(quadratic.chi_square)))
-
-
-def _in_blocks(
-    lanes: int, function: Callable[..., Any], numbers: np.ndarray, tasks: Task
-) -> Any:
-    """Results of a function for all lanes, by a program for so many of them."""
-    blocks = []
-    for first in range(0, len(numbers), lanes):
-        rows = np.arange(first, min(first + lanes, len(numbers)))
-        # The last block repeats its rows, so that all blocks have one shape.
-        block = _rows((numbers, tasks), np.resize(rows, lanes))
-        blocks.append(_rows(function(*block), np.arange(len(rows))))
-    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
-
-
-def _rows(tree: Tree, rows: np.ndarray) -> Tree:
-    """Some rows of all arrays, on the host."""
-    return jax.tree.map(lambda x: np.asarray(x)[rows], tree)
-
-
-def _chosen(found: Found, rows: list[int] | np.ndarray) -> Found:
-    """Some of the points."""
-    return _rows(found, np.asarray(rows, int))
-
-
-def _joined(found: list[Found]) -> Found:
-    """Points of several searches in one."""
-    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+    return rows_of(found, np.flatnonzero(np.isfinite(quadratic.chi_square)))

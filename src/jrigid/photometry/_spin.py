@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jrigid._checks import check_option, demand, whole_number
+from jrigid._core.host_rows import rows_of
 from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix
 from jrigid.mass import from_mesh
@@ -380,7 +381,7 @@ def _inversion(
     )
     scale = max(reduced, 1.0)
     every = [
-        _spin(spins.rows([i]), surface, readings, scale)
+        _spin(rows_of(spins, [i]), surface, readings, scale)
         for i in range(len(spins.numbers))
     ]
     growth = (spins.quadratic.chi_square - spins.quadratic.chi_square[0]) / scale

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jrigid._core.host_rows import in_batches, joined, rows_of
 from jrigid._numerics import product
 from jrigid._types import AnyArray
 from jrigid.photometry._convex import (
@@ -85,11 +86,6 @@ class Spins(NamedTuple):
         """Directions of the poles in space."""
         return poles_of(self.numbers, self.frames)
 
-    def rows(self, chosen: list[int] | np.ndarray) -> "Spins":
-        """Some of the points."""
-        index = np.asarray(chosen, int)
-        return jax.tree.map(lambda x: np.asarray(x)[index], self)
-
 
 def poles_of(
     numbers: Float[np.ndarray, "many numbers"], frames: Float[np.ndarray, "many 3 3"]
@@ -148,9 +144,9 @@ def settled(spins: Spins, surface: Surface, readings: Readings) -> Spins:
     """The points refined to their end, with the mirror of the best; the best first."""
     last = (surface, readings, _LAST_STEPS, _LANES)
     found = best(minimise(spins.numbers, spins.frames, *last), len(spins.numbers))
-    of_mirror = minimise(*mirrored(found.rows([0])), *last)
-    joined = jax.tree.map(lambda *x: np.concatenate(x), found, of_mirror)
-    return best(joined, len(joined.numbers))
+    of_mirror = minimise(*mirrored(rows_of(found, [0])), *last)
+    both = joined([found, of_mirror])
+    return best(both, len(both.numbers))
 
 
 def starts(
@@ -183,14 +179,15 @@ def mirrored(spins: Spins) -> tuple[AnyArray, AnyArray]:
 def best(spins: Spins, count: int) -> Spins:
     """The best points, unlike in their periods or their poles."""
     chi_square = spins.quadratic.chi_square
-    spins = spins.rows(np.flatnonzero(np.isfinite(chi_square)))
+    spins = rows_of(spins, np.flatnonzero(np.isfinite(chi_square)))
     turns = spins.numbers[:, 0]
     # In this scale one threshold serves the turns and the poles.
     poles = spins.poles() * _APART / _APART_IN_POLE
     places = np.column_stack([turns, poles])
     merits = -spins.quadratic.chi_square
     most = int(np.ceil(_SHARE * count))
-    return spins.rows(shared_places(places, turns, merits, _APART, count, most))
+    chosen = shared_places(places, turns, merits, _APART, count, most)
+    return rows_of(spins, chosen)
 
 
 def minimise(
@@ -202,21 +199,14 @@ def minimise(
     lanes: int,
 ) -> Spins:
     """The points after so many steps, so many lanes at a time."""
-    blocks = []
-    for first in range(0, len(numbers), lanes):
-        rows = np.arange(first, min(first + lanes, len(numbers)))
-        block = np.resize(rows, lanes)
+
+    def of_batch(numbers: np.ndarray, frames: np.ndarray) -> Spins:
         result = minimised(
-            spin_quadratic,
-            numbers[block],
-            frames[block],
-            surface,
-            readings,
-            np.asarray(steps),
+            spin_quadratic, numbers, frames, surface, readings, np.asarray(steps)
         )
-        spins = Spins(result[0], frames[block], result[1])
-        blocks.append(spins.rows(np.arange(len(rows))))
-    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+        return Spins(result[0], frames, result[1])
+
+    return in_batches(lanes, of_batch, numbers, frames)
 
 
 class _Loop(NamedTuple):

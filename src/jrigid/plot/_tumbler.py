@@ -1,6 +1,6 @@
 """What the pictures of light curves share: a tumbler at times, and curves beside it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jrigid._checks import check_option, demand
 from jrigid._core.compile import quick_jit
+from jrigid._core.host_rows import in_batches
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.free import free_rotation
@@ -129,8 +130,10 @@ def points_of(curves: Sequence[LightCurve], model: Model) -> Points:
 def attitudes_at(tumbler: Tumbler, ts: AnyArray) -> Float[np.ndarray, "epochs 4"]:
     """Attitudes of a tumbler at times [s]."""
     state = _state_of(tumbler)
-    return _in_blocks(
-        lambda block: _attitudes(tumbler.moments, state, block), np.asarray(ts, float)
+    return in_batches(
+        _BLOCK,
+        lambda block: _attitudes(tumbler.moments, state, block),
+        np.asarray(ts, float),
     )
 
 
@@ -138,7 +141,8 @@ def magnitudes_at(
     tumbler: Tumbler, ts: AnyArray, to_sun: AnyArray, to_observer: AnyArray
 ) -> Numbers:
     """Magnitudes of a tumbler, those of unit brightness being 0."""
-    light = _in_blocks(
+    light = in_batches(
+        _BLOCK,
         lambda *block: _brightness(tumbler.shape, tumbler.scattering, *block),
         attitudes_at(tumbler, ts),
         np.asarray(to_sun, float),
@@ -160,17 +164,6 @@ def unit_of(seconds: float) -> tuple[float, str]:
     """The unit in which a time is a number that reads well."""
     found = (x for x in _UNITS if seconds >= _LEAST_UNITS * x[0])
     return next(found, _UNITS[-1])
-
-
-def _in_blocks(function: Callable[..., Array], *arrays: np.ndarray) -> np.ndarray:
-    """A function of rows of arrays, so many rows at a time."""
-    count = len(arrays[0])
-    done = []
-    for first in range(0, count, _BLOCK):
-        # The last row is repeated to fill the last block.
-        rows = np.minimum(np.arange(first, first + _BLOCK), count - 1)
-        done.append(np.asarray(function(*(x[rows] for x in arrays))))
-    return np.concatenate(done)[:count]
 
 
 @quick_jit
