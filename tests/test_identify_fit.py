@@ -508,6 +508,9 @@ def test_pure_spin_and_a_sphere_do_not_tell_ratios(body, rng):
         assert bool(found.status == Status.UNIDENTIFIABLE), str(found)
     assert "spin is pure: ratios not determined" in found.null_directions
     assert "ratios   not determined" in str(found)
+    # Nothing is said of bodies whose ratios are not determined.
+    assert "equal within" not in str(found)
+    assert "reversed" not in str(found)
     assert np.all(np.isnan(found.ratios_intervals))
 
 

@@ -260,6 +260,15 @@ def test_constant_rates_without_a_noise_tell_no_ratios(rates):
     assert "spin is pure" in str(found)
 
 
+@pytest.mark.parametrize("factor", [1e20, 1e200])
+def test_absurd_rates_are_bad_input_of_which_the_report_says_no_more(readings, factor):
+    rates = identify.Rates(TS, factor * readings, 0.01)
+    found = identify.fit(jr.RigidBody(np.ones(3)), rates, throw=False)
+    assert found.status == Status.BAD_INPUT
+    (line,) = str(found).splitlines()
+    assert "must be in rad/s" in line
+
+
 def test_predictions_that_are_not_finite_matter_only_where_there_is_a_reading(readings):
     seen = np.where(np.abs(readings) > 2.5, readings, np.nan)
     assert 50 < np.sum(np.isnan(seen)) < 150

@@ -4,6 +4,7 @@
 """
 
 import argparse
+import math
 import os
 import re
 import sys
@@ -62,8 +63,7 @@ def _torque(text: str) -> str | identify.GaussMarkov:
     if text == "estimate":
         return text
     values = numbers(text)
-    # A NaN is not 0 or more, either.
-    if len(values) not in (1, 2) or not all(x >= 0 for x in values):
+    if len(values) not in (1, 2) or not all(0 <= x < math.inf for x in values):
         wanted = "must be `estimate`, or one or two numbers from 0, between commas"
         raise argparse.ArgumentTypeError(f"{wanted}, but it is {text!r}")
     return identify.GaussMarkov(*values)

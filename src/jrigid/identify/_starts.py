@@ -513,7 +513,10 @@ def _plain_bodies(readings: DirectReadings, like: np.ndarray) -> np.ndarray:
     They are as large as the body whose tensor is given.
     """
     shown = np.where(readings.valid[..., None], readings.omega, 0.0).reshape(-1, 3)
-    # These are the principal axes of the second moments of the rates.
+    # These are the principal axes of the second moments of the rates, in units of the
+    # largest one, since squares of absurd readings overflow.
+    largest = np.maximum(np.max(np.abs(shown), initial=0.0), np.finfo(shown.dtype).tiny)
+    shown = shown / largest
     axes = np.linalg.eigh(shown.T @ shown)[1]
     # Moments in the ratios 1 : 2 : 2 and 3 : 2 : 2, each axis in turn being the odd
     # one.

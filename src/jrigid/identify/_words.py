@@ -207,8 +207,9 @@ def _of_saturation(result: FitResult) -> list[tuple[Any, str]]:
 def remarks(result: FitResult) -> tuple[str, ...]:
     """What to bear in mind."""
     notes = _of_record(result)
-    # These models assume equal moments, or know them.
-    if not isinstance(result.unknowns.inertia_model, Symmetric | Top | Fixed):
+    # These models assume equal moments, or know them, and a pure spin tells no ratio.
+    assumes = isinstance(result.unknowns.inertia_model, Symmetric | Top | Fixed)
+    if not (assumes or result.diagnostics.pure_spin):
         notes += _of_ratios(result)
         notes += _of_mirror(result)
     return tuple(text for holds, text in notes if holds)
@@ -342,6 +343,8 @@ def report(result: FitResult) -> str:
     if value.ndim:
         return _of_many(value)
     lines = _of_fit(result)
+    if result.status == Status.BAD_INPUT:
+        return lines[0]
     rejected = ", ".join(map(str, np.flatnonzero(result.rejected_trials)))
     lines += [f"  trials left out: {rejected}"] * bool(rejected)
     if result.diagnostics.pure_spin:
