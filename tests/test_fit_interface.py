@@ -547,7 +547,10 @@ def test_what_cannot_be_used_is_said_in_a_sentence(
         (["fit", "a", "--unmodelled", "some"], "must be `estimate`, or one or two"),
         (["fit", "a", "--unmodelled", "1,2,3"], "two numbers from 0, between commas"),
         (["fit", "a", "--unmodelled", "-1"], "from 0, between commas, but it is '-1'"),
-        (["fit", "a", "--unmodelled", "inf"], "from 0, between commas, but it is 'inf'"),
+        (
+            ["fit", "a", "--unmodelled", "inf"],
+            "from 0, between commas, but it is 'inf'",
+        ),
         (["fit", "a", "--inertia-model", "cube"], "invalid choice"),
         (["fit", "a", "--save", "none/a.pkl"], "argument --save: its folder must"),
         (["fit", "a", "--plot", "none/a.png"], "argument --plot: its folder must"),

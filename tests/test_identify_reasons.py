@@ -363,8 +363,51 @@ def test_rates_along_space_axes_are_named(turning):
     right = identify.Rates(ts, rates, 0.01)
     both = [[(identify.Attitudes(ts, q, 0.01), x)] for x in (gyro, right)]
     many = identify.fit_each(BLIND, both)
-    expected = [[False, False, False, True], [False] * 4]
+    expected = [[False, False, False, True, False], [False] * 5]
     np.testing.assert_array_equal(many.diagnostics.conventions, expected)
+
+
+# Two kinds of functions of time, each with programs of its own.
+SAMPLED = "table", "function"
+
+
+def spun_up(t):
+    """Momentum of a wheel that is spun up and down."""
+    return jnp.multiply.outer(0.8 * jnp.sin(2.0 * t), jnp.array([0.6, 0.0, 0.8]))
+
+
+@pytest.mark.parametrize(
+    "kind", ["array", *(pytest.param(x, marks=pytest.mark.slow) for x in SAMPLED)]
+)
+def test_a_wheel_of_the_wrong_sign_is_named(kind, rng):
+    ts = np.linspace(0, 8, 160)
+    clock = np.linspace(-0.5, 8.5, 181)
+    momenta = {
+        "array": np.array([0.3, 0.2, 0.9]),
+        "table": jr.torques.Sampled(clock, np.asarray(spun_up(clock))),
+        "function": spun_up,
+    }
+    opposite = {
+        "array": -momenta["array"],
+        "table": jr.torques.Sampled(clock, -np.asarray(spun_up(clock))),
+        "function": lambda t: -spun_up(t),
+    }
+    wheel = jr.torques.Rotor(momenta[kind])
+    body = jr.RigidBody(np.array([1.0, 1.7, 2.3]), wheel)
+    state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.9, 1.1, -0.7]))
+    rates = np.asarray(jr.simulate(body, state, ts=ts).states.omega)
+    record = identify.Rates(ts, rates + 0.01 * rng.normal(size=rates.shape), 0.01)
+
+    def found(momentum):
+        guess = jr.RigidBody(np.ones(3), jr.torques.Rotor(momentum))
+        return identify.fit(guess, record, scale="rotor", throw=False)
+
+    right = found(momenta[kind])
+    assert right.status == Status.OK
+    assert not np.any(right.diagnostics.conventions)
+    wrong = found(opposite[kind])
+    assert wrong.status != Status.OK
+    assert reason(wrong).startswith("The momentum of the rotor seems to have the wrong")
 
 
 def test_a_wrong_model_is_no_wrong_convention():
@@ -380,7 +423,7 @@ def test_a_wrong_model_is_no_wrong_convention():
     # Nor does a wrong model hide a wrong convention.
     turned = identify.Attitudes(ts, conjugated(q), 0.01), records[1]
     wrong = identify.fit(BLIND, [turned], throw=False)
-    assert list(wrong.diagnostics.conventions) == [False, True, False, False]
+    assert list(wrong.diagnostics.conventions) == [False, True, False, False, False]
 
 
 def test_turns_of_attitudes_and_rates_are_compared_at_any_times(turning, untyped):

@@ -8,18 +8,21 @@ body must turn from one attitude to the next as the rates say. Attitudes alone a
 fitted anew.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jrigid.identify import _host as host
 from jrigid.identify._quality import FOLLOWED, Fit, misfit, sums_of, unexplained
 from jrigid.identify._records import Record
 from jrigid.identify._sensors import AttitudeSensor, Gyro
+from jrigid.systems import RigidBody
+from jrigid.torques import Rotor, Sampled
 
 # Chi-square for each degree of freedom beyond which another reading is worth a try, and
 # the part of it that is left if that reading is right.
@@ -96,7 +99,39 @@ def _space_axes(records: Records) -> Records | None:
 
 
 _READINGS: tuple[Reading, ...] = (_scalar_last, _space_to_body, _degrees, _space_axes)
-COUNT = len(_READINGS)
+# The last one is that of wheels.
+COUNT = len(_READINGS) + 1
+WHEELS = COUNT - 1
+
+
+class _Reversed(eqx.Module):
+    """Minus a function of time."""
+
+    function: Callable[..., Array]
+
+    def __call__(self, t: Any) -> Array:
+        return -self.function(t)
+
+
+def _reversed(momentum: Any) -> Any:
+    """The momentum of a wheel that turns the other way."""
+    if isinstance(momentum, Sampled):
+        return dataclasses.replace(momentum, values=-momentum.values)
+    return _Reversed(momentum) if callable(momentum) else -momentum
+
+
+def wheels_reversed(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...] | None:
+    """The bodies with rotors that turn the other way; None if there is no rotor."""
+
+    def is_rotor(part: Any) -> bool:
+        return isinstance(part, Rotor)
+
+    def turned(part: Any) -> Any:
+        return Rotor(_reversed(part.momentum)) if is_rotor(part) else part
+
+    if not any(map(is_rotor, jax.tree.leaves(systems, is_leaf=is_rotor))):
+        return None
+    return jax.tree.map(turned, systems, is_leaf=is_rotor)
 
 
 def readings(records: Records) -> Iterator[tuple[int, Records]]:
@@ -232,7 +267,9 @@ def _seen(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def in_words(conventions: np.ndarray) -> str:
     """Which conventions the record seems to have, or an empty text without any."""
-    is_scalar_last, is_space_to_body, is_in_degrees, is_along_space = conventions
+    is_scalar_last, is_space_to_body, is_in_degrees, is_along_space, reverse = (
+        conventions
+    )
     if is_scalar_last and is_space_to_body:
         return (
             "The attitudes seem to be scalar last, or from space to body; they do not "
@@ -255,5 +292,10 @@ def in_words(conventions: np.ndarray) -> str:
         return (
             "The rates seem to be along space axes: pass them along body axes, by "
             "`jr.rotation.rotate_inverse`."
+        )
+    if reverse:
+        return (
+            "The momentum of the rotor seems to have the wrong sign: pass minus the "
+            "momentum, or turn the axis of the wheel."
         )
     return ""

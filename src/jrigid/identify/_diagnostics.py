@@ -62,7 +62,7 @@ class Diagnostics(eqx.Module):
             integrates it.
         conventions: Whether the attitudes of a record that the fit is far from seem to
             be scalar last, or from space to body; or its rates in degrees a second, or
-            along space axes.
+            along space axes; or the momentum of its rotor to have the wrong sign.
         input_result: `jrigid.RESULTS` of the input.
 
     >>> import jax.numpy as jnp, jrigid as jr
@@ -98,5 +98,5 @@ class Diagnostics(eqx.Module):
     pure_spin: Bool[Array, ""]
     ambiguous: Bool[Array, ""]
     integration_error: Scalar
-    conventions: Bool[Array, "4"]
+    conventions: Bool[Array, "5"]
     input_result: Any

@@ -824,14 +824,22 @@ def _conventions(
 ) -> Bool[np.ndarray, " conventions"]:
     """In which other conventions the record would fit; in none if it is not far."""
     found = np.zeros(conventions.COUNT, bool)
-    records = on_host(task.records)
     if not conventions.is_far(best):
         return found
+    records = on_host(task.records)
     by_turns = conventions.of_turns(records)
-    if by_turns is not None:
-        return by_turns
-    for index, changed in conventions.readings(records):
-        found[index] = _fits_as(task._replace(records=changed), best, effort)
+    if by_turns is None:
+        for index, changed in conventions.readings(records):
+            found[index] = _fits_as(task._replace(records=changed), best, effort)
+    else:
+        found |= by_turns
+    systems = conventions.wheels_reversed(task.systems)
+    if systems is not None:
+        one, *others = systems
+        bodies = _Bodies(systems if others else one)
+        systems = bodies.of_trials(task.records[0].ts.shape[0])
+        changed = task._replace(bodies=bodies, systems=systems)
+        found[conventions.WHEELS] = _fits_as(changed, best, effort)
     return found
 
 
