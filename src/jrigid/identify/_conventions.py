@@ -36,6 +36,8 @@ _COARSE = 2.0  # radians between samples of a gyro
 _MOST = 2000  # samples of a trial that are compared
 
 Records = tuple[Record, ...]
+# Of a wheel: constant, or a function of time.
+Momentum = Array | Callable[..., Array]
 # Returns None for records to which the convention does not apply.
 Reading = Callable[[Records], Records | None]
 
@@ -113,7 +115,7 @@ class _Reversed(eqx.Module):
         return -self.function(t)
 
 
-def _reversed(momentum: Any) -> Any:
+def _reversed(momentum: Momentum) -> Momentum:
     """The momentum of a wheel that turns the other way."""
     if isinstance(momentum, Sampled):
         return dataclasses.replace(momentum, values=-momentum.values)
