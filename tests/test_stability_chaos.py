@@ -63,6 +63,62 @@ def spectrum_of_heavy(lanes, count):
 # Tangents
 
 
+def spinning_satellite():
+    """Its wheel makes it nutate 22 times an orbit."""
+    pull = jr.torques.GravityGradient(1.0, jr.torques.KeplerOrbit(1.0, 1.0, 0.0))
+    wheel = jr.torques.Rotor(jnp.array([0.0, 0.0, 30.0]))
+    return jr.RigidBody(jnp.array([1.0, 2.0, 2.5]), pull + wheel)
+
+
+def test_steps_too_coarse_for_small_motions_alone_are_refused():
+    """In a relative equilibrium the motion has no error in any step."""
+    body, start = spinning_satellite(), state([0, 0, 0], [0, 0, 1.0])
+    with pytest.raises(RuntimeError, match="fine enough"):
+        st.megno(body, start, 50 * TURN, 24 * 50)
+    fine = st.megno(body, start, 50 * TURN, 200 * 50)
+    assert abs(float(fine.megno)) < 0.01
+    damper = jr.torques.InternalDamper(0.001, 0.2)
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), damper)
+    coarse = st.lyapunov_spectrum(body, start, 20.0, 1000, throw=False)
+    assert coarse.result == jr.RESULTS.inaccurate
+    fine = st.lyapunov_spectrum(body, start, 20.0, 4000)
+    rates = jr.stability.linearize(body, start).matrix
+    np.testing.assert_allclose(fine.exponents.sum(), np.trace(rates), rtol=1e-6)
+
+
+def test_small_motions_that_become_parallel_are_refused():
+    lever = jnp.array([0.1, 0.2, 1.0])
+    torque = jr.torques.UniformGravity(1.0, lever, jnp.array([0.0, 0.0, -1.0]))
+    body = jr.RigidBody(jnp.array([1.0, 1.5, 0.7]), torque)
+    start = state([1.2, 0, 0], [0.3, 0.2, 0.8])
+
+    def found(every):
+        return st.lyapunov_spectrum(
+            body, start, 800.0, 6400, every=every, samples=1, throw=False
+        )
+
+    assert abs(float(found(100).exponents.sum())) < 1e-9
+    assert found(1600).result == jr.RESULTS.inaccurate
+
+
+@pytest.mark.parametrize("rate", [0.3, 1.0, 3.9])
+def test_vectors_are_in_radians_and_radians_a_second(rate):
+    """A free sphere turns by a change of its rate times the time."""
+    vector = np.array([0.0, 0.0, 1.0, 0.0, 0.0, rate])
+    sphere, start = jr.RigidBody(jnp.ones(3)), state([0, 0, 0], [0, 0, rate])
+    found = st.lyapunov_spectrum(
+        sphere, start, 2.0, 100, vectors=vector[None], every=100, samples=1
+    )
+    growth = float(np.exp(2.0 * found.exponents[0]))
+    units = 2.0 ** np.arange(-6, 7)
+    before, after = (np.hypot(x, rate / units) for x in (1.0, 1.0 + 2.0 * rate))
+    # One of the powers of two near the rate is the unit of the length.
+    assert (
+        np.min(np.abs(after / before - growth)[np.abs(np.log2(units / rate)) < 2])
+        < 1e-9
+    )
+
+
 @pytest.mark.parametrize("damped", [False, True])
 def test_growth_is_that_of_neighbours_of_the_motion(damped, rng):
     """Over a short time a small motion's growth is the difference of two motions,

@@ -124,8 +124,8 @@ class RESULTS(
     )
     inaccurate = (
         "Arguments `steps` or `step` must be fine enough for the accuracy of the "
-        "motion, but they are not. (Equal steps pass over the jumps of a torque. "
-        "`simulate` ends steps there.)"
+        "motion, but they are not. (Equal steps pass over the jumps of a torque, where "
+        "`simulate` ends steps. Of exponents, `every` may be too large instead.)"
     )
     invalid_tolerance = (
         "Arguments `rtol` and `atol` must be below 1 and at least 1e-14 (1e-7 in "

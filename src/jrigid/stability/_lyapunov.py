@@ -61,7 +61,8 @@ class LyapunovSpectrum(NamedTuple):
         ts: Times since the start [s].
         history: Exponents up to each of these times [1/s].
         final_state: State at the end.
-        error: Largest local error of a step, in the scales of the variables.
+        error: Largest local error of a step: in the scales of the variables, and that
+            of a small motion relative to its length.
         result: `jrigid.RESULTS`.
     """
 
@@ -88,7 +89,8 @@ class Megno(NamedTuple):
         ts: Times since the start [s].
         history: `megno` up to each of these times.
         final_state: State at the end.
-        error: Largest local error of a step, in the scales of the variables.
+        error: Largest local error of a step: in the scales of the variables, and that
+            of a small motion relative to its length.
         result: `jrigid.RESULTS`.
     """
 
@@ -137,7 +139,10 @@ def _schedule(steps: int, every: int, samples: int, fewest: int = 1) -> _Schedul
 def _starting_vectors(
     motion: Motion, vectors: ArrayLike | None, count: int | None
 ) -> Array:
-    """Small motions to start from: the given rows, or generic ones along no axis."""
+    """Small motions to start from: the given rows, or generic ones along no axis.
+
+    Those that are given are in SI units, and the others in the scales of the motion.
+    """
     dimension = motion.dimension
     if vectors is None:
         count = dimension if count is None else whole_number("count", count)
@@ -158,15 +163,19 @@ def _starting_vectors(
 def _findings(motion: Motion, rows: Array) -> Findings:
     """What is wrong with the values of a motion and of its starting vectors."""
     findings = findings_of(motion)
-    lengths = jnp.sqrt(jnp.sum(rows**2, axis=1))
-    least = _INDEPENDENT * jnp.finfo(rows.dtype).eps * lengths
     message = (
         "Arguments `vector(s)` must be finite and linearly independent, but they are "
         "not."
     )
-    independent = jnp.all(orthonormal(rows)[1] > least)
+    independent = _are_independent(rows, orthonormal(rows)[1])
     findings.require(independent, RESULTS.invalid_state, message)
     return findings
+
+
+def _are_independent(rows: Array, lengths: Array) -> Array:
+    """Whether rows are independent, from the lengths of their orthogonal parts."""
+    least = _INDEPENDENT * jnp.finfo(rows.dtype).eps
+    return jnp.all(lengths > least * jnp.sqrt(jnp.sum(rows**2, axis=1)))
 
 
 class _Growth(NamedTuple):
@@ -192,6 +201,9 @@ def _follow(
         y, local = path.follow(index * schedule.steps, schedule.steps, y)
         # Otherwise all tangents would turn into the direction of fastest growth.
         rows, lengths = orthonormal(path.tangents(y))
+        # Of nearly parallel tangents rounding is what is left.
+        apart = _are_independent(path.tangents(y), lengths)
+        local = jnp.where(apart, local, jnp.inf)
         # The rows had length 1 at the start of the interval.
         logs = jnp.log(lengths)
         number = (1 + index).astype(y.dtype)
@@ -228,9 +240,12 @@ class _Indicators(NamedTuple):
 
 
 @quick_jit
-def _indicators(motion: Motion, schedule: _Schedule, rows: Array) -> _Indicators:
+def _indicators(
+    motion: Motion, schedule: _Schedule, rows: Array, given: bool
+) -> _Indicators:
     findings = _findings(motion, rows)
     path = walk(motion, schedule.total, findings.ok)
+    rows = rows / path.units_of_tangents[None] if given else rows
     y = path.with_tangents(path.start, orthonormal(rows)[0])
 
     def follow(path: Walk, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -265,7 +280,7 @@ def _settled_indicators(
 ) -> _Indicators:
     """Both indicators of a motion, or an error."""
     rows = _starting_vectors(motion, vectors, count)
-    indicators = _indicators(motion, schedule, rows)
+    indicators = _indicators(motion, schedule, rows, vectors is not None)
     return settle(indicators, throw, _findings, motion, rows)
 
 
@@ -301,10 +316,13 @@ def lyapunov_spectrum(
         args: Passed to the torque.
         t0: Time at the start [s].
         count: Number of exponents, from the largest; all by default.
-        vectors: Small motions to start from: rows of (rotation vector in body axes,
-            change of the rate over the initial one, ...). They stay in any set that the
-            motion keeps invariant, such as that of a planar motion. Gives `count`.
-        every: Number of steps between two orthogonalisations.
+        vectors: Small motions to start from, which give `count`: rows of (rotation
+            vector in body axes [rad], change of the rate [rad/s], changes of internal
+            parts). They stay in any set that the motion keeps invariant, such as that
+            of a planar motion. Their growth is that of a length in which rates count in
+            a unit near the largest rate of the motion, a power of two.
+        every: Number of steps between two orthogonalisations. Vectors that become
+            parallel in between raise an error.
         samples: Number of times in `history`.
         solver: A diffrax solver with an error estimate; `diffrax.Dopri8()` by default.
         throw: With False, a bad or an inaccurate lane gives a result code and NaN.
@@ -314,7 +332,7 @@ def lyapunov_spectrum(
         fill all intervals.
 
     Raises:
-        RuntimeError: A value is bad, or the steps are too coarse.
+        RuntimeError: A value is bad, the steps are too coarse, or `every` is too large.
 
     Gradients: none to be relied on. Those of a chaotic motion grow as fast as it does.
     Source: G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980)

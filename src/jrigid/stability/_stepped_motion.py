@@ -110,6 +110,11 @@ class Walk(NamedTuple):
         # A turn has three components where the quaternion has four.
         return y[self.scales.size :].reshape(-1, self.scales.size - 1)
 
+    @property
+    def units_of_tangents(self) -> Array:
+        """The unit of each component of a tangent: radians, and the scales of rates."""
+        return jnp.concatenate([jnp.ones_like(self.scales[:3]), self.scales[4:]])
+
     def with_tangents(self, y: Array, rows: Array) -> Array:
         """The state with these tangents."""
         return jnp.concatenate([y[: self.scales.size], rows.reshape(-1)])
@@ -175,11 +180,17 @@ class Walk(NamedTuple):
     def advance(
         self, t: Array, y: Array, in_lanes: bool = False
     ) -> tuple[Array, Array]:
-        """State after one step, and its local error."""
+        """State after one step, and its local error.
+
+        The error of a tangent is relative to its length.
+        """
         after, error, _ = self._step(t, y, in_lanes)
-        return self.on_sphere(after), jnp.max(
-            jnp.abs(error[: self.scales.size]) / self.scales
-        )
+        size = self.scales.size
+        errors = [jnp.abs(error[:size]) / self.scales]
+        # In a relative equilibrium the motion has no error, but tangents oscillate.
+        for tangent, wrong in zip(self.tangents(y), self.tangents(error), strict=True):
+            errors.append(jnp.abs(wrong) / safe_norm(tangent))
+        return self.on_sphere(after), jnp.max(jnp.concatenate(errors))
 
     def within(self, t: Array, y: Array) -> Callable[[Array], Array]:
         """States within one step, as a function of the fraction of it."""
