@@ -674,6 +674,9 @@ def test_arguments_that_are_wrong_are_named():
             quiet(lambda p: p.a, points=points)
     with pytest.raises(ValueError, match="`points` must hold a point, but it is empty"):
         quiet(jnp.sum, points=np.zeros((0, 3)))
+    large = np.array([2**53, 2**53 + 1])
+    with pytest.raises(ValueError, match="the integers of 'x' are none: pass them by"):
+        jr.sweep(lambda x: 1.0 * x, {"x": large}, progress=False)
     with pytest.raises(ValueError, match="`axes` must hold points, but 'x' is empty"):
         quiet(jnp.sin, {"x": np.zeros(0)})
     with pytest.raises(ValueError, match="must name at least one"):

@@ -122,8 +122,15 @@ def grid_of(axes: Mapping[str, ArrayLike] | None, points: PyTree) -> Grid:
         )
     shape = tuple(x.size for x in arrays.values())
     # All axes get one dtype, as the arguments of other functions.
-    values = map(np.asarray, float_arrays(*arrays.values()))
-    return Grid(dict(zip(arrays, values, strict=True)), tuple(arrays), shape, shape)
+    numbers = map(np.asarray, float_arrays(*arrays.values()))
+    values = dict(zip(arrays, numbers, strict=True))
+    for name, x in arrays.items():
+        demand(
+            x.dtype.kind == "f" or np.array_equal(x, values[name].astype(x.dtype)),
+            f"Argument `axes` must hold floating point numbers, but the integers of "
+            f"{name!r} are none: pass them by `points`.",
+        )
+    return Grid(values, tuple(arrays), shape, shape)
 
 
 def _native(values: ArrayLike) -> np.ndarray:

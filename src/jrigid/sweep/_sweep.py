@@ -69,7 +69,8 @@ def sweep(
             of the points. As for `jax.jit`, what it closes over must not change. It
             returns an array, a code, or a tree of them. Inside, pass `throw=False` to
             functions that take it, so that points that fail are NaN.
-        axes: Name and points of each axis; the last one runs fastest.
+        axes: Name and points of each axis; the last one runs fastest. They become
+            floating point numbers; integers, such as seeds, go into `points`.
         points: In place of axes: any tree of arrays whose first axis is that of the
             points.
         store: A directory that keeps finished blocks (zarr, version 3; extra

@@ -88,6 +88,12 @@ class GravityGradient(AbstractTorque):
     body on which it acts, with that of each `SpinningMass` in the same sum.
     `GravityGradient(mu, position).of_body(inertia)` can be called without a body.
 
+    The body turns the field's energy into rotation, but its orbit does not lose it: of
+    a `FloatingBody` the energy and the angular momentum are therefore constant only to
+    the square of its size over the distance. Where that matters, give `systems.Force`
+    the force -grad V beside that of the attractor, V being `potential`, with the
+    potential energy of the other forces alone.
+
     Attributes:
         mu: Gravitational parameter of the attractor [m^3/s^2].
         position: `position(t) -> (3,)`, from the attractor to the body, space
