@@ -53,6 +53,10 @@ def two_trials(*torques, **options):
     return jr.identify.fit(bodies, [rates(), rates()], **options)
 
 
+def two_sigmas(_, gyro):
+    return jr.identify.prior(gyro.bias, np.ones(2))
+
+
 def wheel(size):
     return jr.torques.Rotor(lambda t: size * t * OMEGA)
 
@@ -113,6 +117,20 @@ MISTAKES = {
     "a position of a sampler without the states": (
         lambda: jr.identify.log_density(found_once()).function(found_once().numbers),
         r"`position` must have shape \(8,\), but it has shape \(5,\)",
+    ),
+    "a prior of another shape": (
+        lambda: fit(
+            BLIND, rates(), free=lambda _, x: jr.identify.prior(x.bias, [1, 1])
+        ),
+        r"`sigma` of the prior of gyro.bias must have shape \(3,\) or be a number",
+    ),
+    "a delay that a gyro lacks": (
+        lambda: fit(BLIND, rates(), free=lambda _, x: x.delay),
+        r"What is None there needs a value, as `Gyro\(delay=0.0\)`",
+    ),
+    "a start with two moments": (
+        lambda: fit(BLIND, rates(), start=(np.ones(2), None)),
+        r"`start` must",
     ),
     "a prior without width": (
         lambda: fit(BLIND, rates(), free=lambda _, x: jr.identify.prior(x.bias, 0.0)),

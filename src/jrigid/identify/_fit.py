@@ -463,11 +463,14 @@ def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
     if isinstance(unmodelled, str):
         check_option("unmodelled", unmodelled, ("estimate",))
         return "estimate", GaussMarkov(0.0)
+    torque = unmodelled
+    shown = repr(unmodelled)
+    if isinstance(torque, GaussMarkov):
+        shown = f"one of level {torque.level} and correlation time {torque.time}"
     text = (
         "Argument `unmodelled` must be 0, a positive level, one for each body axis, a "
-        f"`GaussMarkov` or 'estimate', but it is {unmodelled!r}."
+        f"`GaussMarkov` or 'estimate', but it is {shown}."
     )
-    torque = unmodelled
     if not isinstance(torque, GaussMarkov):
         demand(np.shape(unmodelled) in ((), (3,)), text)
         torque = GaussMarkov(unmodelled)

@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import (
+    INERTIA,
     RESULTS,
     Findings,
     all_finite,
+    array_of_shape,
     check_option,
     demand,
     is_good,
@@ -105,7 +107,9 @@ def start_of(start: Any, trials: int) -> tuple[Any, State | None, Any]:
         internal = state.internal
         attitude = jnp.broadcast_to(state.attitude, (trials, 4))
         state = State(attitude, jnp.broadcast_to(state.omega, (trials, 3)))
-    tensor = None if inertia is None else as_tensor(jnp.asarray(inertia))
+    tensor = None
+    if inertia is not None:
+        tensor = as_tensor(array_of_shape("start", inertia, *INERTIA))
     return tensor, state, internal  # type: ignore[return-value]
 
 

@@ -238,12 +238,15 @@ def _of_noise(result: FitResult) -> str:
     residuals = f"The residuals are {size:.3g} times the stated noise"
     if square < 1 - chance:
         degrees = ""
-        # The noise in rad/s over the same noise in deg/s is pi / 180 = 0.017.
+        # The noise in radians over the same noise in degrees is pi / 180 = 0.017.
         if 0.01 < size < 0.03:
-            degrees = " (it is 57 times too large if it is in deg/s)"
+            degrees = " (it is 57 times too large if it is in degrees)"
+        unit = "in the unit of the readings"
+        if all(isinstance(x, Gyro) for x in result.fitted()[1:]):
+            unit = "in rad/s"
         return (
             f"{residuals}: `sigma` is too large{degrees}. Pass the noise of the sensor "
-            "in rad/s."
+            f"{unit}."
         )
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
     if stands_out(band, sure):

@@ -487,8 +487,8 @@ class FitResult(eqx.Module):
         """Value and error of each array that `free` picked, by name; of a single fit.
 
         An array that is sought anew in each trial has an axis of trials in front. One
-        that may not be negative and ended at zero has an infinite error: the record
-        only bounds it from above.
+        that may not be negative and ended at zero has the error that it would have if
+        it might: the record bounds it from above.
         """
         demand_single(self)
         estimates = {}

@@ -71,6 +71,10 @@ _LEVELS = 12
 _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
+# Logarithms of values that are small enough in their unit, the largest first, and the
+# rise of chi-square that they may cost.
+_SMALL = (-7.0, -11.0, -15.0)
+_NO_RISE = 0.01
 # Logarithms of elements of L of a body that is thicker than flat: the first one tried,
 # the thickest and the thinnest.
 _FIRST_THICKNESS = -3.5
@@ -487,6 +491,8 @@ def search(case: Case) -> Search:
         ambiguous = ambiguous or rival
         wrong = misfit(best)
         weak = weakest(best)
+    best = yield from _off_zero(case, best)
+    weak = weakest(best)
     best = dataclasses.replace(best, ambiguous=ambiguous)
     if wrong == 0 and not ambiguous and not problem.options.dense:
         # Squares beside levels of their own differ, so fits with a level are not
@@ -495,6 +501,32 @@ def search(case: Case) -> Search:
     if _is_thickness_unknown(best):
         thicker = yield from _thicker(case, best)
         best = dataclasses.replace(best, thicker=thicker)
+    return best
+
+
+def _off_zero(case: Case, best: Fit) -> Search:
+    """The minimum with values that vanished moved off zero, where nothing changes.
+
+    A positive array is an exponential of its numbers where it is small. At zero it has
+    no slope, so that the errors of all else would be those for an array that is known
+    to be zero.
+    """
+    before = best.minimum
+    stage = stages_of(case, slow=False)[-1]._replace(steps=1)
+    settings = _settings(stage, best.kept, best.scales, best.disturbance)
+    for least in _SMALL:
+        point = before.point
+        numbers, own = best.problem.unknowns.off_zero(point.numbers, point.own, least)
+        if np.array_equal(numbers, point.numbers) and np.array_equal(own, point.own):
+            return best
+        moved = point._replace(numbers=numbers, own=own)
+        minimum = yield Request(best.problem, best.layout, moved, settings)
+        fit = dataclasses.replace(
+            best, minimum=minimum._replace(settled=before.settled), computed={}
+        )
+        rise = weakest(fit).square - weakest(best).square
+        if rise < _NO_RISE * weakest(best).noise:
+            return fit
     return best
 
 

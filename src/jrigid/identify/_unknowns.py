@@ -155,6 +155,11 @@ class AbstractSought(Readable):
         square = product("...n,nm,...m->...", slopes, covariance, slopes)
         return self.value(x), jnp.sqrt(jnp.maximum(square, 0.0))
 
+    def off_zero(self, x: np.ndarray, least: float) -> np.ndarray:
+        """The numbers, of which logarithms are no lower than this."""
+        del least
+        return x
+
     def log_volume(self, x: Array) -> Array:
         """Logarithm of the volume of arrays over that of the numbers they stand for."""
         # A tensor has more elements than numbers, hence the root of a Gram determinant.
@@ -205,6 +210,9 @@ class _Positive(AbstractSought):
         is_zero = (x < _ZERO).reshape(self.base.shape)
         return values, jnp.where(is_zero, jnp.inf, errors)
 
+    def off_zero(self, x: np.ndarray, least: float) -> np.ndarray:
+        return np.maximum(x, least)
+
 
 class _Definite(AbstractSought):
     """A symmetric, positive definite tensor L L^T.
@@ -234,6 +242,9 @@ class _Definite(AbstractSought):
         # The other entries of L are judged by the largest of its diagonal.
         largest = jnp.maximum(jnp.max(jnp.exp(x[:3])), 1.0)
         return jnp.concatenate([jnp.ones_like(x[:3]), jnp.full_like(x[3:], largest)])
+
+    def off_zero(self, x: np.ndarray, least: float) -> np.ndarray:
+        return np.concatenate([np.maximum(x[:3], least), x[3:]])
 
 
 class _Arrays(NamedTuple):
@@ -356,7 +367,7 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
         bool(picks) and all(isinstance(x, _Pick) for x in chosen),
         "Argument `free` must be a function of the system and the sensors that picks "
         "floating point arrays of theirs, beside the inertia, which is always sought, "
-        "but it is not.",
+        "but it is not. (What is None there needs a value, as `Gyro(delay=0.0)`.)",
     )
     return [picks[index] for index in sorted(picks)]
 
@@ -494,6 +505,24 @@ class Unknowns(eqx.Module):
         parts = [x.start().astype(dtype) for x, _ in self.own_slices]
         numbers = xp.concatenate([xp.zeros(0, dtype), *parts])
         return xp.tile(numbers, (trials, 1))
+
+    def off_zero(
+        self, numbers: np.ndarray, own: np.ndarray, least: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers, those of positive arrays no lower than this.
+
+        Args:
+            numbers: Of all trials.
+            own: Of each trial (trials, own).
+            least: Logarithm of the least value, in the unit of its array.
+        """
+        numbers, own = numbers.copy(), own.copy()
+        slices = self.slices
+        for x in self.shared:
+            numbers[slices[x.name]] = x.off_zero(numbers[slices[x.name]], least)
+        for x, part in self.own_slices:
+            own[:, part] = [x.off_zero(row, least) for row in own[:, part]]
+        return numbers, own
 
     @property
     def leaves(self) -> tuple[AnyArray, ...]:
@@ -671,12 +700,19 @@ def _sought(
     # states no unit.
     unit = or_one(xp.asarray(unit, dtype))
     unit = xp.broadcast_to(unit, base.shape).astype(dtype)
+    name = _name(arrays.parts, path)
+    shape = np.shape(0.0 if pick.sigma is None else pick.sigma)
+    demand(
+        shape in ((), base.shape),
+        f"Argument `sigma` of the prior of {name} must have shape {base.shape} or be a "
+        f"number, but it has shape {shape}.",
+    )
     kind = _Real
     if _field_metadata(arrays.parts, path).get("positive"):
         kind = _Definite if base.shape == (3, 3) else _Positive
     return kind(
         index=pick.index,
-        name=_name(arrays.parts, path),
+        name=name,
         own=pick.own,
         base=base,
         unit=without_gradient(unit),  # its choice must not change a derivative
