@@ -209,6 +209,35 @@ def test_several_objects_are_refused(tmp_path):
         ph.read_alcdef(write(tmp_path, [*lines, *other]), linear)
 
 
+def test_numbers_and_designations_tell_objects_apart(tmp_path):
+    padded = block([("2457100.5", "15.0")], OBJECTNUMBER="00433")
+    plain = block([("2457100.6", "15.0")], OBJECTNUMBER="433")
+    assert len(ph.read_alcdef(write(tmp_path, [*padded, *plain]), linear)) == 2
+    one = block([("2457100.5", "15.0")], OBJECTNUMBER="0", MPCDESIG="2001 AA")
+    other = block([("2457100.6", "15.0")], OBJECTNUMBER="0", MPCDESIG="2002 BB")
+    assert len(ph.read_alcdef(write(tmp_path, [*one, *one]), linear)) == 2
+    with pytest.raises(ValueError, match="the object is 2002 BB, but that of sessions"):
+        ph.read_alcdef(write(tmp_path, [*one, *other]), linear)
+
+
+@pytest.mark.parametrize("epoch", [np.nan, np.inf, 57100.5])
+def test_an_epoch_that_is_no_julian_date_is_refused(epoch, tmp_path):
+    with pytest.raises(ValueError, match="`epoch` must be a Julian date of this age"):
+        ph.read_alcdef(write(tmp_path, GOOD), linear, epoch=epoch)
+
+
+def test_kilometres_and_astronomical_units_are_refused(tmp_path):
+    dates = 2457099.0 + np.arange(6)
+    sun, observer = linear(dates)
+    for unit in (1e3, 1.495978707e11):
+        with pytest.raises(ValueError, match="must give the Sun in metres"):
+            ph.geometry_of_table(dates, sun / unit, observer / unit)
+        with pytest.raises(ValueError, match="must give the Sun in metres"):
+            ph.read_alcdef(
+                write(tmp_path, GOOD), lambda x, u=unit: [y / u for y in linear(x)]
+            )
+
+
 def test_positions_must_be_vectors(tmp_path):
     path = write(tmp_path, GOOD)
 

@@ -254,14 +254,17 @@ def test_a_noise_that_is_not_stated_does_not_hide_a_misfit(factor, follows):
     [
         ({"curves": []}, "must hold a light curve, but it is empty"),
         ({"threshold": -1.0}, "`threshold` must not be negative"),
-        ({"noise": 0.0}, "`noise` must be positive or None"),
+        ({"noise": 0.0}, "`noise` must be a positive number or None"),
         ({"shortest": 8.0 * HOUR}, "must be periods in seconds in rising order"),
         ({"shortest": 60.0}, "trial periods, more than 50000: narrow the range"),
         ({"degree": 1}, "`degree` must be"),
         ({"degree": 13}, "`degree` must be at most 12, but it is 13"),
         ({"facets": 20}, "`facets` must be"),
         ({"fitted": ["colour"]}, "`fitted`"),
-        ({"fitted": ["slope"]}, "must be empty or `lambert` without two curves that"),
+        (
+            {"fitted": ["slope"]},
+            "must be empty or `lambert` for curves that are relative",
+        ),
         ({"closure": 0.0}, "`closure` must be positive"),
         ({"scattering": ph.Mixture(-0.1)}, "must have a positive `lambert`"),
         ({"scattering": ph.Mixture(0.1, width=0.0)}, "must have a positive `width`"),
@@ -271,6 +274,46 @@ def test_malformed_arguments_say_what_to_pass(changes, message):
     arguments = {"curves": observed(0.01, True, 0.0, nights=3), "noise": 0.01, **RANGE}
     with pytest.raises(ValueError, match=message):
         ph.find_spin(**(arguments | changes))
+
+
+def test_errors_of_points_are_no_noise(untyped):
+    curves = observed(0.01, True, 0.0, nights=3)
+    with pytest.raises(ValueError, match="are those of a `LightCurve`"):
+        ph.find_spin(curves, np.array([0.01, 0.02]), **RANGE)
+
+
+def test_curves_at_one_time_and_epochs_of_two_kinds_are_refused():
+    curves = observed(0.01, True, 0.0, nights=3)
+    still = [dataclasses.replace(x, ts=0 * x.ts) for x in curves]
+    with pytest.raises(ValueError, match="more than half of `shortest`, but they span"):
+        ph.find_spin(still, 0.01, **RANGE)
+    mixed = [*curves[:2], dataclasses.replace(curves[2], epoch=curves[2].epoch - 2.4e6)]
+    with pytest.raises(ValueError, match="are some modified Julian dates"):
+        ph.find_spin(mixed, 0.01, **RANGE)
+
+
+def test_sparse_calibrated_points_of_one_curve_say_something_of_the_phase_function():
+    curves = observed(0.01, False, 0.2)
+
+    def joined(name):
+        return np.concatenate([getattr(x, name) for x in curves])
+
+    fields = ("ts", "brightness", "to_sun", "to_observer")
+    one = dataclasses.replace(curves[0], **{name: joined(name) for name in fields})
+    search = {"shortest": PERIOD, "longest": PERIOD, "fitted": ("slope",), **SMALL}
+    both = [ph.find_spin(x, 0.01, **search).solutions[0] for x in (curves, [one])]
+    np.testing.assert_allclose(both[0].chi_square, both[1].chi_square, rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.03])
+def test_a_noise_stated_too_large_does_not_hide_a_misfit(factor):
+    """At another period neighbouring residuals are alike."""
+    period = factor * PERIOD
+    found = ph.find_spin(
+        observed(0.01, True, 0.2), 0.1, shortest=period, longest=period, **SMALL
+    )
+    assert found.reduced_chi_square < 0.7
+    assert found.follows == (factor == 1.0)
 
 
 def test_a_single_curve_is_told_from_a_list(untyped):

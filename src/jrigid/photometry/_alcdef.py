@@ -10,7 +10,13 @@ from jaxtyping import Float
 from jrigid._checks import demand
 from jrigid.photometry._astropy import TDB, TIME_SCALES, in_tdb
 from jrigid.photometry._files import ASTRONOMICAL_UNIT, LightCurve
-from jrigid.photometry._orbit import LEAST_DATE, Positions, Vectors, light_time
+from jrigid.photometry._orbit import (
+    LEAST_DATE,
+    Positions,
+    Vectors,
+    check_metres,
+    light_time,
+)
 
 _DAY = 86400  # s
 _DELIMITERS = {"PIPE": "|", "TAB": "\t"}
@@ -232,24 +238,34 @@ def read_alcdef(
     if epoch is not None:
         # `repr` gives the digits that were typed, not those of the binary fraction.
         zero = Decimal(repr(float(epoch)))
+        demand(
+            zero.is_finite() and zero >= LEAST_DATE,
+            "Argument `epoch` must be a Julian date of this age, but it is "
+            f"{epoch}: of a modified one, add 2400000.5 days.",
+        )
     return [_curve(parser, session, positions, zero) for session in parser.sessions]
 
 
 def _check_one_object(parser: _Parser) -> None:
-    """Raise ValueError for sessions of several numbered objects."""
-    first = None
-    for session in parser.sessions:
-        line, number = session.metadata.get("OBJECTNUMBER", (session.line, ""))
-        # Objects without a number have 0, and more than one name.
-        if number in ("", "0"):
-            continue
-        if first is not None and number != first:
-            raise parser.error(
-                f"the object is {number[:20]}, but that of sessions before is "
-                f"{first[:20]}: split the file, since `positions` is of one object.",
-                line,
-            )
-        first = number
+    """Raise ValueError for sessions of several objects.
+
+    Objects without a number have 0, and names may be written in several ways.
+    """
+    for key in ("OBJECTNUMBER", "MPCDESIG"):
+        first = None
+        for session in parser.sessions:
+            line, words = session.metadata.get(key, (session.line, ""))
+            own = words.lstrip("0").upper()
+            if not own:
+                continue
+            if first is not None and own != first:
+                raise parser.error(
+                    f"the object is {own[:20]}, but that of sessions before is "
+                    f"{first[:20]}: split the file, since `positions` is of one "
+                    "object.",
+                    line,
+                )
+            first = own
 
 
 def _curve(
@@ -307,6 +323,7 @@ def _vectors(
             "are not: check the dates that it covers."
         )
     to_sun, to_observer = vectors
+    check_metres("positions", to_sun)
     return to_sun, to_observer
 
 

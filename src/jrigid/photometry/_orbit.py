@@ -15,6 +15,7 @@ SPEED_OF_LIGHT = 299792458.0  # m / s
 # Of the Sun [m^3 / s^2], JPL's ephemeris DE440.
 _GRAVITATIONAL_PARAMETER = 1.32712440041e20
 _RADIUS_OF_THE_SUN = 7e8  # m
+_SOLAR_RADIUS = 6.957e8  # m
 LEAST_DATE = 2_378_497  # 1800: no photometry is older
 _DAY = 86400.0  # s
 _J2000 = 2451545.0
@@ -240,6 +241,7 @@ def geometry_of_table(
         f"Arguments `to_sun` and `to_observer` must be finite and have the shape {shape}, "
         "but they are not.",
     )
+    check_metres("to_sun", vectors[0])
     # Small numbers keep the digits of a time of day, which a Julian date loses.
     spline = CubicSpline(dates - dates[0], np.stack(vectors, axis=1))
 
@@ -255,6 +257,17 @@ def geometry_of_table(
         return sun, observer
 
     return positions
+
+
+def check_metres(name: str, to_sun: Vectors) -> None:
+    """Raise ValueError for vectors to the Sun that end inside of it."""
+    nearest = float(np.min(np.linalg.norm(to_sun, axis=-1)))
+    demand(
+        nearest > _SOLAR_RADIUS,
+        f"Argument `{name}` must give the Sun in metres, but its distance is "
+        f"{nearest:.4g}: of kilometres or astronomical units, pass 1e3 or "
+        f"{ASTRONOMICAL_UNIT} times as much.",
+    )
 
 
 def _dates(julian_dates: Real[ArrayLike, "..."]) -> Float[np.ndarray, " epochs"]:

@@ -21,6 +21,8 @@ _LEAST_SIZE = 1e-9
 # Of the sum of the unit vectors to the Sun and the observer, which is zero where the
 # body shows its dark side.
 _LEAST_LIT = 1e-6
+# Epochs further apart [d] are Julian dates and modified ones.
+_LONGEST_AGE = 1e6
 # Standard deviations of chi-square, and of a correlation, that are no chance.
 _SURE = 4.0
 
@@ -121,12 +123,13 @@ def readings_of(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
     _check_curves(curves)
+    _check_epochs(curves)
     demand(
         bool(np.all((noise > 0) & np.isfinite(noise))),
         f"Argument `noise` must be positive and finite, but it is {noise}.",
     )
     epoch = curves[0].epoch
-    ts = np.concatenate([x.ts + (x.epoch - epoch) * _DAY for x in curves])
+    ts = np.concatenate([np.asarray(x.ts) + (x.epoch - epoch) * _DAY for x in curves])
     # Seen from the middle of the span, errors of the frequencies are hardly correlated
     # with those of the phases.
     middle = (ts.min() + ts.max()) / 2
@@ -191,6 +194,22 @@ def check_threshold(threshold: float) -> None:
     )
 
 
+def phase_angles(curve: LightCurve) -> Float[np.ndarray, " epochs"]:
+    """Angles between the Sun and the observer, seen from the body [rad]."""
+    sun, observer = (_unit(np.asarray(x)) for x in (curve.to_sun, curve.to_observer))
+    return np.arccos(np.clip(np.sum(sun * observer, axis=-1), -1.0, 1.0))
+
+
+def _check_epochs(curves: Sequence[LightCurve]) -> None:
+    """Raise ValueError for epochs that are not dates of one kind."""
+    epochs = np.array([x.epoch for x in curves], float)
+    demand(
+        bool(np.all(np.isfinite(epochs)) and np.ptp(epochs) < _LONGEST_AGE),
+        "Argument `curves` must have Julian dates as epochs, but they are from "
+        f"{epochs.min()} to {epochs.max()}: are some modified Julian dates?",
+    )
+
+
 def check_list(curves: Sequence[LightCurve]) -> None:
     """Raise ValueError for a single light curve in place of a list."""
     demand(
@@ -221,11 +240,12 @@ def follows(
         the curves.
     """
     correlation, deviations = _correlation(residuals, curves)
-    if stated:
-        # Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
-        return correlation, bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
-    # A noise that was found makes chi-square over its degrees of freedom 1.
-    return correlation, deviations <= _SURE
+    # A noise that was found makes chi-square over its degrees of freedom 1, and one that
+    # was stated too large hides a misfit, which neighbouring points share.
+    is_white = deviations <= _SURE
+    # Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
+    is_small = bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
+    return correlation, is_white and (is_small or not stated)
 
 
 def _correlation(

@@ -39,6 +39,7 @@ from jrigid.photometry._readings import (
     check_threshold,
     follows,
     noise_in_words,
+    phase_angles,
     readings_of,
     stated_noise,
 )
@@ -70,6 +71,8 @@ _FULL = (
 )
 # Within a curve the phase function is nearly constant, as is the factor that a relative
 # curve leaves open.
+# Phase angles that differ by less [rad] say nothing of the phase function.
+_LEAST_ANGLES = float(np.radians(1.0))
 _NEEDS_SCALE = ("amplitude", "width", "slope")
 
 
@@ -278,18 +281,21 @@ def check_curves(
         len(curves) > 0, "Argument `curves` must hold a light curve, but it is empty."
     )
     demand(
-        noise is None or noise > 0,
-        f"Argument `noise` must be positive or None, but it is {noise}.",
+        noise is None or (np.ndim(noise) == 0 and noise > 0),
+        f"Argument `noise` must be a positive number or None, but it is {noise}: errors "
+        "of points are those of a `LightCurve`.",
     )
     for name in fitted:
         check_option("fitted", name, SCATTERING)
-    # Within one curve the phase angle hardly changes.
-    scaled = sum(not curve.is_relative for curve in curves) > 1
+    # Relative curves say nothing of the phase function, nor do calibrated ones that
+    # were all taken at one phase angle.
+    angles = [phase_angles(x) for x in curves if not x.is_relative]
+    known = float(np.ptp(np.concatenate(angles))) if angles else 0.0
     demand(
-        scaled or not set(fitted) & set(_NEEDS_SCALE),
-        "Argument `fitted` must be empty or `lambert` without two curves that are not "
-        "relative: others say nothing of the phase function. It is "
-        f"{tuple(fitted)}.",
+        known > _LEAST_ANGLES or not set(fitted) & set(_NEEDS_SCALE),
+        "Argument `fitted` must be empty or `lambert` for curves that are relative, or "
+        f"whose phase angles differ by {np.degrees(known):.1f} degrees, but it is "
+        f"{tuple(fitted)}: they say nothing of the phase function.",
     )
 
 
@@ -320,6 +326,11 @@ def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
         0 < shortest <= longest,
         "Arguments `shortest` and `longest` must be periods in seconds in rising order, "
         f"but they are {shortest} and {longest}.",
+    )
+    demand(
+        span > shortest / 2,
+        "Argument `curves` must span more than half of `shortest`, but they span "
+        f"{span:.3g} s.",
     )
     turns = span / longest, span / shortest
     count = (turns[1] - turns[0]) / STRIDE
