@@ -272,7 +272,7 @@ def test_a_mirror_explains_what_is_seen_from_a_plane(mode, rng):
         )
         numbers = numbers_of(tumbler, data, epoch)[None]
         found = search._minimised(data, numbers, task, search._LAST_STEPS)
-        both = search._best(search._joined([found, search._mirrored(data, found)]))
+        both = search._best(search.joined([found, search._mirrored(data, found)]))
         scale = both.quadratic.chi_square[0] / 360
         assert 0.7 < scale < 1.3
         index = search.index_of_mirror(data, both)

@@ -202,5 +202,5 @@ def test_mistakes_say_what_to_pass(relative):
     with pytest.raises(ValueError, match="say nothing of the phase function"):
         ph.fit_shape(curves, start, NOISE, epoch=EPOCH, fitted=("slope",))
     one = [dataclasses.replace(curves[0], is_relative=False), *curves[1:]]
-    with pytest.raises(ValueError, match="without two curves that are not relative"):
+    with pytest.raises(ValueError, match="for curves that are relative"):
         ph.fit_shape(one, start, NOISE, epoch=EPOCH, fitted=("slope",))

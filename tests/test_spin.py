@@ -11,8 +11,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from jrigid import photometry as ph
+from jrigid._core.host_rows import rows_of
 from jrigid.photometry import _convex as convex
 from jrigid.photometry import _readings as readings
+from jrigid.photometry import _spin as spin
+from jrigid.photometry import _spin_search as search
+from jrigid.photometry._refine import Quadratic
 
 HOUR, DAY, AU = 3600.0, 86400.0, 149597870700.0
 PERIOD = 7.1 * HOUR
@@ -316,11 +320,50 @@ def test_a_noise_stated_too_large_does_not_hide_a_misfit(factor):
     assert found.follows == (factor == 1.0)
 
 
+def test_errors_of_a_pole_hold_other_minima_about_it():
+    """Two minima as good, across longitude 0, are one pole of twice the spread."""
+    _, inversion = found()
+    first = inversion.solutions[0]
+
+    def moved(longitude, chi_square):
+        estimates = first.estimates._replace(longitude=np.asarray(longitude))
+        return dataclasses.replace(first, estimates=estimates, chi_square=chi_square)
+
+    own = first.errors.longitude
+    alone = spin._with_spread([moved(0.1, 50.0)], 1.0)
+    np.testing.assert_allclose(alone.errors.longitude, own)
+    both = spin._with_spread([moved(6.2, 50.0), moved(0.1, 50.0)], 1.0)
+    gap = 0.1 - (6.2 - 2 * np.pi)
+    expected = np.sqrt(own**2 + gap**2 / 2)
+    np.testing.assert_allclose(both.errors.longitude, expected)
+    np.testing.assert_allclose(both.errors.period, first.errors.period)
+    # A minimum that is much worse adds nothing.
+    worse = spin._with_spread([moved(6.2, 150.0), moved(0.1, 50.0)], 1.0)
+    np.testing.assert_allclose(worse.errors.longitude, own)
+    assert worse.estimates.longitude == 0.1
+
+
+def test_minima_about_a_pole_are_told_from_other_poles():
+    # Turns, longitude and latitude are the first numbers, in the frame of the pole.
+    numbers = np.zeros((4, 12))
+    numbers[:, 0] = [10.0, 10.1, 10.0, 10.0]
+    numbers[:, 1] = [0.0, 0.1, 0.5, 0.0]
+    numbers[:, 2] = [0.0, 0.0, 0.0, 0.05]
+    frames = np.tile(search.frame_of_pole(np.array([1.0, 0.0, 0.0])), (4, 1, 1))
+    quadratic = Quadratic(np.arange(4.0), np.zeros((4, 12)), np.zeros(4))
+    spins = search.Spins(numbers, frames, quadratic)
+    kept = search.best(spins, 4)
+    np.testing.assert_array_equal(kept.quadratic.chi_square, [0.0, 2.0])
+    assert len(search.distinct(spins).numbers) == 4
+    near = search.neighbours(spins, rows_of(kept, [0]))
+    np.testing.assert_array_equal(near, [0, 1, 3])
+
+
 def test_a_single_curve_is_told_from_a_list(untyped):
     (curve,) = observed(0.01, True, 0.0, nights=1)
-    for search in (ph.find_spin, ph.find_tumblers):
+    for find in (ph.find_spin, ph.find_tumblers):
         with pytest.raises(ValueError, match="must be a list of light curves"):
-            search(curve, 0.01, **RANGE)
+            find(curve, 0.01, **RANGE)
 
 
 def test_too_few_points_are_refused():

@@ -51,6 +51,8 @@ from jrigid.photometry._spin_search import (
     SEARCHED_FACETS,
     STRIDE,
     Spins,
+    best,
+    neighbours,
     search_spins,
     settled,
 )
@@ -391,13 +393,18 @@ def _inversion(
         readings.in_magnitudes(left), curves, reduced, free, stated
     )
     scale = max(reduced, 1.0)
-    every = [
-        _spin(rows_of(spins, [i]), surface, readings, scale)
-        for i in range(len(spins.numbers))
-    ]
-    growth = (spins.quadratic.chi_square - spins.quadratic.chi_square[0]) / scale
+    unlike = best(spins, len(spins.numbers))
+    every = []
+    for i in range(len(unlike.numbers)):
+        one = rows_of(unlike, [i])
+        minima = [
+            _spin(rows_of(spins, [k]), surface, readings, scale)
+            for k in neighbours(spins, one).tolist()
+        ]
+        every.append(_with_spread(minima, scale))
+    growth = (unlike.quadratic.chi_square - unlike.quadratic.chi_square[0]) / scale
     near = int(np.count_nonzero(growth <= threshold))
-    mirror = _index_of_mirror(spins)
+    mirror = _index_of_mirror(unlike)
     return SpinInversion(
         solutions=every[:near],
         rejected=every[near:],
@@ -410,6 +417,32 @@ def _inversion(
         follows=is_followed,
         is_noise_found=not stated,
     )
+
+
+def _with_spread(minima: list[Spin], scale: float) -> Spin:
+    """The best of the minima about a pole, with errors that hold the others.
+
+    They are those of a mixture of normal distributions, one about each minimum.
+    """
+    lowest = min(minima, key=lambda spin: spin.chi_square)
+    growth = np.array([(x.chi_square - lowest.chi_square) / scale for x in minima])
+    weights = np.exp(-growth / 2)
+    weights = weights / np.sum(weights)
+
+    def error(name: str) -> np.ndarray:
+        moves = [
+            getattr(x.estimates, name) - getattr(lowest.estimates, name) for x in minima
+        ]
+        if name == "longitude":
+            moves = [np.mod(x + np.pi, 2 * np.pi) - np.pi for x in moves]
+        squares = [
+            getattr(x.errors, name) ** 2 + move**2
+            for x, move in zip(minima, moves, strict=True)
+        ]
+        return np.asarray(np.sqrt(np.tensordot(weights, np.stack(squares), 1)))
+
+    errors = SpinEstimates(*map(error, SpinEstimates._fields))
+    return dataclasses.replace(lowest, errors=errors)
 
 
 def _index_of_mirror(spins: Spins) -> int | None:
@@ -501,7 +534,8 @@ def _report(found: SpinInversion) -> str:
     if others:
         grown = others[0].chi_square - found.solutions[0].chi_square
         lines.append(
-            f"The next solution has a chi-square that is larger by {grown:.0f}."
+            "The best one of all others that the search kept has a chi-square that is "
+            f"larger by {grown:.0f}."
         )
     elif len(found.solutions) >= REFINED:
         lines.append(_FULL)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jrigid._checks import demand
 from jrigid._core.host_rows import in_batches, joined, rows_of
 from jrigid._numerics import product
 from jrigid._types import AnyArray
@@ -54,6 +55,8 @@ _LAST_STEPS = 200
 # poles by less than a quarter of a radian.
 _APART = 0.3
 _APART_IN_POLE = 0.25
+# Minima whose poles differ by less [rad] are the same minimum.
+_SAME_POLE = 0.01
 # A period has many poles. It takes no more than this part of the places while there are
 # other periods, so that it does not hide them.
 _SHARE = 1 / 3
@@ -136,17 +139,36 @@ def search_spins(
     finer = surface.centre.size - finalists.numbers.shape[1]
     numbers = np.pad(finalists.numbers, ((0, 0), (0, finer)))
     full = minimise(numbers, finalists.frames, searched, readings, _FULL_STEPS, _LANES)
-    full = best(full, REFINED)
-    return settled(full, surface, readings)
+    kept = _chosen(full, REFINED, _APART_IN_POLE)
+    demand(
+        len(kept) > 0,
+        "Arguments `shortest` and `longest` must hold a rotation whose light is finite "
+        "at all epochs of `curves`, but they do not.",
+    )
+    near = [neighbours(full, rows_of(full, [i])) for i in kept.tolist()]
+    return settled(rows_of(full, np.unique(np.concatenate(near))), surface, readings)
 
 
 def settled(spins: Spins, surface: Surface, readings: Readings) -> Spins:
-    """The points refined to their end, with the mirror of the best; the best first."""
+    """The points refined to their end, with the mirror of the best; the best first.
+
+    Minima of one period and pole are all kept.
+    """
     last = (surface, readings, _LAST_STEPS, _LANES)
-    found = best(minimise(spins.numbers, spins.frames, *last), len(spins.numbers))
+    found = distinct(minimise(spins.numbers, spins.frames, *last))
     of_mirror = minimise(*mirrored(rows_of(found, [0])), *last)
-    both = joined([found, of_mirror])
-    return best(both, len(both.numbers))
+    return distinct(joined([found, of_mirror]))
+
+
+def neighbours(spins: Spins, one: Spins) -> Int[np.ndarray, " near"]:
+    """Indices of the points with the period and the pole of a point, itself among them.
+
+    A facet has a kink where it becomes lit or visible, so that chi-square has several
+    minima about a pole, some degrees apart.
+    """
+    turns = np.abs(spins.numbers[:, 0] - one.numbers[0, 0])
+    apart = np.abs(spins.poles() - one.poles()).max(axis=1)
+    return np.flatnonzero((turns <= _APART) & (apart <= _APART_IN_POLE))
 
 
 def starts(
@@ -176,18 +198,32 @@ def mirrored(spins: Spins) -> tuple[AnyArray, AnyArray]:
     return numbers, np.asarray(spins.frames) * [-1.0, -1.0, 1.0]
 
 
+def distinct(spins: Spins) -> Spins:
+    """The points that are unlike in their periods or their poles at all."""
+    return rows_of(spins, _chosen(spins, len(spins.numbers), _SAME_POLE))
+
+
 def best(spins: Spins, count: int) -> Spins:
     """The best points, unlike in their periods or their poles."""
-    chi_square = spins.quadratic.chi_square
-    spins = rows_of(spins, np.flatnonzero(np.isfinite(chi_square)))
-    turns = spins.numbers[:, 0]
+    return rows_of(spins, _chosen(spins, count, _APART_IN_POLE))
+
+
+def _chosen(spins: Spins, count: int, apart: float) -> Int[np.ndarray, " chosen"]:
+    """Indices of the best points that are unlike in their periods or their poles.
+
+    Args:
+        spins: The points; those of no chi-square are left out.
+        count: How many to choose.
+        apart: Distance from which poles are apart.
+    """
+    finite = np.flatnonzero(np.isfinite(spins.quadratic.chi_square))
+    turns = spins.numbers[finite, 0]
     # In this scale one threshold serves the turns and the poles.
-    poles = spins.poles() * _APART / _APART_IN_POLE
+    poles = spins.poles()[finite] * _APART / apart
     places = np.column_stack([turns, poles])
-    merits = -spins.quadratic.chi_square
+    merits = -spins.quadratic.chi_square[finite]
     most = int(np.ceil(_SHARE * count))
-    chosen = shared_places(places, turns, merits, _APART, count, most)
-    return rows_of(spins, chosen)
+    return finite[shared_places(places, turns, merits, _APART, count, most)]
 
 
 def minimise(
