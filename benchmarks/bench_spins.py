@@ -94,7 +94,8 @@ def observed(seed):
             sun, earth = positions(dates)
             # 299792458 m/s is the speed of light.
             ts = (dates - EPOCH) * DAY - np.linalg.norm(earth, axis=1) / 299792458.0
-            turn = tilt * Rotation.from_euler("z", 2 * np.pi * ts / period)
+            spins = np.multiply.outer(2 * np.pi * ts / period, [0.0, 0.0, 1.0])
+            turn = tilt * Rotation.from_rotvec(spins)
             lit, seen = (
                 np.maximum(turn.inv().apply(unit(x)) @ normals.T, 0)
                 for x in (sun, earth)

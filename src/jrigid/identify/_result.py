@@ -521,8 +521,9 @@ class FitResult(eqx.Module):
         An array is determined where its errors are below 0.3 of its size, or of its
         natural unit if that is larger; one that is sought anew in each trial, where it
         is in every trial that took part. The inertia, where `status` does not say
-        otherwise. A fit that ended neither OK nor MISFIT nor UNIDENTIFIABLE determines
-        nothing. Of a single fit.
+        otherwise. Where the inertia is not determined, errors of arrays are those near
+        the estimate, and bodies far from it may have other values. A fit that ended
+        neither OK nor MISFIT nor UNIDENTIFIABLE determines nothing. Of a single fit.
 
         >>> import jax.numpy as jnp, jrigid as jr
         >>> record = jr.datasets.gyro_example()
