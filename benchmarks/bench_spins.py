@@ -76,12 +76,14 @@ def observed(seed):
     longitude = rng.uniform(0, 2 * np.pi)
     latitude = np.arcsin(rng.uniform(-1, 1))
     period = rng.uniform(5, 9) * HOUR
-    angles = rng.uniform(0, 2 * np.pi, 3)
+    node, perihelion, anomaly = rng.uniform(0, 2 * np.pi, 3)
     orbit = ph.Orbit(
         rng.uniform(2.2, 3.0) * AU,
         rng.uniform(0.05, 0.25),
         np.deg2rad(rng.uniform(3, 20)),
-        *angles,
+        node,
+        perihelion,
+        anomaly,
         EPOCH,
     )
     positions = ph.geometry_of_orbit(orbit)
