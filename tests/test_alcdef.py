@@ -215,8 +215,16 @@ def test_numbers_and_designations_tell_objects_apart(tmp_path):
     assert len(ph.read_alcdef(write(tmp_path, [*padded, *plain]), linear)) == 2
     one = block([("2457100.5", "15.0")], OBJECTNUMBER="0", MPCDESIG="2001 AA")
     other = block([("2457100.6", "15.0")], OBJECTNUMBER="0", MPCDESIG="2002 BB")
-    assert len(ph.read_alcdef(write(tmp_path, [*one, *one]), linear)) == 2
-    with pytest.raises(ValueError, match="the object is 2002 BB, but that of sessions"):
+    same = block([("2457100.6", "15.0")], OBJECTNUMBER="0", MPCDESIG="2001_aa")
+    assert len(ph.read_alcdef(write(tmp_path, [*one, *same]), linear)) == 2
+    # A numbered object has the designations of all its discoveries.
+    names = ("1898 DQ", "1956 PC", "I98D00Q")
+    lines = []
+    for i, name in enumerate(names):
+        point = [(f"245710{i}.5", "15.0")]
+        lines += block(point, OBJECTNUMBER="433", MPCDESIG=name)
+    assert len(ph.read_alcdef(write(tmp_path, lines), linear)) == 3
+    with pytest.raises(ValueError, match="the object is 2002BB, but that of sessions"):
         ph.read_alcdef(write(tmp_path, [*one, *other]), linear)
 
 
@@ -229,6 +237,9 @@ def test_an_epoch_that_is_no_julian_date_is_refused(epoch, tmp_path):
 def test_kilometres_and_astronomical_units_are_refused(tmp_path):
     dates = 2457099.0 + np.arange(6)
     sun, observer = linear(dates)
+    # A body as far from the Sun as Jupiter's Trojans.
+    with pytest.raises(ValueError, match="must give the Sun in metres"):
+        ph.geometry_of_table(dates, 2.5 * sun / 1e3, observer)
     for unit in (1e3, 1.495978707e11):
         with pytest.raises(ValueError, match="must give the Sun in metres"):
             ph.geometry_of_table(dates, sun / unit, observer / unit)

@@ -410,6 +410,33 @@ def test_a_wheel_of_the_wrong_sign_is_named(kind, rng):
     assert reason(wrong).startswith("The momentum of the rotor seems to have the wrong")
 
 
+class Geared(eqx.Module):
+    """Momentum of a wheel behind a gear."""
+
+    gain: Array
+
+    def __call__(self, t):
+        return self.gain * spun_up(t)
+
+
+def test_a_wheel_of_the_wrong_sign_is_named_while_its_gain_is_sought(rng):
+    ts = np.linspace(0, 8, 160)
+    wheel = jr.torques.Rotor(Geared(jnp.asarray(1.0)))
+    body = jr.RigidBody(np.array([1.0, 1.7, 2.3]), wheel)
+    state = jr.State(np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.9, 1.1, -0.7]))
+    rates = np.asarray(jr.simulate(body, state, ts=ts).states.omega)
+    record = identify.Rates(ts, rates + 0.01 * rng.normal(size=rates.shape), 0.01)
+    guess = jr.RigidBody(np.ones(3), jr.torques.Rotor(Geared(jnp.asarray(-1.0))))
+    found = identify.fit(
+        guess,
+        record,
+        scale="rotor",
+        free=lambda body: identify.prior(body.torque.momentum.gain, 0.01),
+        throw=False,
+    )
+    assert "momentum of the rotor seems to have the wrong sign" in reason(found)
+
+
 def test_a_wrong_model_is_no_wrong_convention():
     """A body that is brought nearly to rest, fitted without its drag."""
     ts = np.linspace(0, 12, 60)

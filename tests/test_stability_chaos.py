@@ -101,6 +101,19 @@ def test_small_motions_that_become_parallel_are_refused():
     assert found(1600).result == jr.RESULTS.inaccurate
 
 
+def test_vectors_of_a_slow_body_are_told_apart_in_its_own_scale():
+    """In SI units they differ by less than what single precision counts as apart."""
+    rate = np.float32(3.7e-5)
+    sphere = jr.RigidBody(np.ones(3, np.float32))
+    start = jr.State(np.eye(1, 4, dtype=np.float32)[0], rate * np.float32([0, 0, 1]))
+    vectors = np.float32([[0, 0, 1, 0, 0, 0], [0, 0, 1, 0, 0, 3e-5]])
+    found = st.lyapunov_spectrum(
+        sphere, start, np.float32(1e5), 200, vectors=vectors, throw=False
+    )
+    assert found.result == jr.RESULTS.successful
+    assert np.all(np.isfinite(found.exponents))
+
+
 @pytest.mark.parametrize("rate", [0.3, 1.0, 3.9])
 def test_vectors_are_in_radians_and_radians_a_second(rate):
     """A free sphere turns by a change of its rate times the time."""

@@ -8,21 +8,21 @@ body must turn from one attitude to the next as the rates say. Attitudes alone a
 fitted anew.
 """
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float, PyTree
 
+from jrigid._types import BodyState, ScalarLike, Vector
 from jrigid.identify import _host as host
 from jrigid.identify._quality import FOLLOWED, Fit, misfit, sums_of, unexplained
 from jrigid.identify._records import Record
 from jrigid.identify._sensors import AttitudeSensor, Gyro
 from jrigid.systems import RigidBody
-from jrigid.torques import Rotor, Sampled
+from jrigid.torques import Rotor
 
 # Chi-square for each degree of freedom beyond which another reading is worth a try, and
 # the part of it that is left if that reading is right.
@@ -36,8 +36,6 @@ _COARSE = 2.0  # radians between samples of a gyro
 _MOST = 2000  # samples of a trial that are compared
 
 Records = tuple[Record, ...]
-# Of a wheel: constant, or a function of time.
-Momentum = Array | Callable[..., Array]
 # Returns None for records to which the convention does not apply.
 Reading = Callable[[Records], Records | None]
 
@@ -106,20 +104,13 @@ COUNT = len(_READINGS) + 1
 WHEELS = COUNT - 1
 
 
-class _Reversed(eqx.Module):
-    """Minus a function of time."""
+class _Reversed(Rotor):
+    """A rotor that turns the other way, with the arrays that `free` may pick."""
 
-    function: Callable[..., Array]
-
-    def __call__(self, t: Any) -> Array:
-        return -self.function(t)
-
-
-def _reversed(momentum: Momentum) -> Momentum:
-    """The momentum of a wheel that turns the other way."""
-    if isinstance(momentum, Sampled):
-        return dataclasses.replace(momentum, values=-momentum.values)
-    return _Reversed(momentum) if callable(momentum) else -momentum
+    def internal_momentum(
+        self, t: ScalarLike, state: BodyState, args: PyTree
+    ) -> Vector:
+        return -super().internal_momentum(t, state, args)
 
 
 def wheels_reversed(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...] | None:
@@ -129,7 +120,7 @@ def wheels_reversed(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...] | N
         return isinstance(part, Rotor)
 
     def turned(part: Any) -> Any:
-        return Rotor(_reversed(part.momentum)) if is_rotor(part) else part
+        return _Reversed(part.momentum) if is_rotor(part) else part
 
     if not any(map(is_rotor, jax.tree.leaves(systems, is_leaf=is_rotor))):
         return None

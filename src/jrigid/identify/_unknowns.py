@@ -658,6 +658,12 @@ def unknowns_of(
         if pick.groups is not None:
             groups[x.name] = _members(pick.groups, trials, rate.dtype)
             x = _by_groups(x, groups[x.name].shape[1])
+        shape = np.shape(0.0 if x.sigma is None else x.sigma)
+        demand(
+            _fits_into(shape, x.base.shape),
+            f"Argument `sigma` of the prior of {x.name} must have shape "
+            f"{x.base.shape} or be a number, but it has shape {shape}.",
+        )
         sought.append(x)
     inertia = systems[0].inertia
     # The inertia of a fit is known, and numpy compiles nothing. That of a plan is
@@ -700,24 +706,25 @@ def _sought(
     # states no unit.
     unit = or_one(xp.asarray(unit, dtype))
     unit = xp.broadcast_to(unit, base.shape).astype(dtype)
-    name = _name(arrays.parts, path)
-    shape = np.shape(0.0 if pick.sigma is None else pick.sigma)
-    demand(
-        shape in ((), base.shape),
-        f"Argument `sigma` of the prior of {name} must have shape {base.shape} or be a "
-        f"number, but it has shape {shape}.",
-    )
     kind = _Real
     if _field_metadata(arrays.parts, path).get("positive"):
         kind = _Definite if base.shape == (3, 3) else _Positive
     return kind(
         index=pick.index,
-        name=name,
+        name=_name(arrays.parts, path),
         own=pick.own,
         base=base,
         unit=without_gradient(unit),  # its choice must not change a derivative
         sigma=None if pick.sigma is None else xp.asarray(pick.sigma, dtype),
     )
+
+
+def _fits_into(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
+    """Whether an array of a shape can be broadcast to another shape."""
+    try:
+        return np.broadcast_shapes(shape, whole) == whole
+    except ValueError:
+        return False
 
 
 def _by_groups(sought: AbstractSought, groups: int) -> AbstractSought:

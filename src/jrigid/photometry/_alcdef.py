@@ -249,23 +249,27 @@ def read_alcdef(
 def _check_one_object(parser: _Parser) -> None:
     """Raise ValueError for sessions of several objects.
 
-    Objects without a number have 0, and names may be written in several ways.
+    Objects without a number have 0, and are told by their designations. A numbered
+    object may have several of these.
     """
-    for key in ("OBJECTNUMBER", "MPCDESIG"):
-        first = None
-        for session in parser.sessions:
-            line, words = session.metadata.get(key, (session.line, ""))
-            own = words.lstrip("0").upper()
-            if not own:
-                continue
-            if first is not None and own != first:
-                raise parser.error(
-                    f"the object is {own[:20]}, but that of sessions before is "
-                    f"{first[:20]}: split the file, since `positions` is of one "
-                    "object.",
-                    line,
-                )
-            first = own
+    first: dict[str, str] = {}
+    for session in parser.sessions:
+        key = "OBJECTNUMBER"
+        line, number = session.metadata.get(key, (session.line, ""))
+        own = number.lstrip("0")
+        if not own:
+            key = "MPCDESIG"
+            line, designation = session.metadata.get(key, (session.line, ""))
+            own = designation.replace(" ", "").replace("_", "").upper()
+        if not own:
+            continue
+        before = first.setdefault(key, own)
+        if own != before:
+            raise parser.error(
+                f"the object is {own[:20]}, but that of sessions before is "
+                f"{before[:20]}: split the file, since `positions` is of one object.",
+                line,
+            )
 
 
 def _curve(

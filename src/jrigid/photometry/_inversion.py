@@ -71,8 +71,9 @@ class Inversion:
         correlation: Of the best alias's residuals at neighbouring points of a curve. It
             is near 0 for noise, and near 1 for a light curve that is missed.
         follows: Whether the best alias follows the curves to their noise, as far as it
-            is known: if it is not stated, its residuals need only be uncorrelated. This
-            says little of curves whose points are far apart in time.
+            is known. If it is not stated, or stated too large, its residuals need only be
+            uncorrelated, which says little of curves whose points are far apart in
+            time.
         determined: Whether the curves determine the motion: the best alias follows
             them, and all others have its periods and its mode. Their momenta may point
             elsewhere.

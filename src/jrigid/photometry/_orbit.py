@@ -15,7 +15,8 @@ SPEED_OF_LIGHT = 299792458.0  # m / s
 # Of the Sun [m^3 / s^2], JPL's ephemeris DE440.
 _GRAVITATIONAL_PARAMETER = 1.32712440041e20
 _RADIUS_OF_THE_SUN = 7e8  # m
-_SOLAR_RADIUS = 6.957e8  # m
+# No known asteroid comes so near to the Sun [m], and no planet is so far from it [km].
+_NEAREST = 5e9
 LEAST_DATE = 2_378_497  # 1800: no photometry is older
 _DAY = 86400.0  # s
 _J2000 = 2451545.0
@@ -260,10 +261,10 @@ def geometry_of_table(
 
 
 def check_metres(name: str, to_sun: Vectors) -> None:
-    """Raise ValueError for vectors to the Sun that end inside of it."""
+    """Raise ValueError for vectors to the Sun that are too short for metres."""
     nearest = float(np.min(np.linalg.norm(to_sun, axis=-1)))
     demand(
-        nearest > _SOLAR_RADIUS,
+        nearest > _NEAREST,
         f"Argument `{name}` must give the Sun in metres, but its distance is "
         f"{nearest:.4g}: of kilometres or astronomical units, pass 1e3 or "
         f"{ASTRONOMICAL_UNIT} times as much.",

@@ -240,12 +240,13 @@ def follows(
         the curves.
     """
     correlation, deviations = _correlation(residuals, curves)
-    # A noise that was found makes chi-square over its degrees of freedom 1, and one that
-    # was stated too large hides a misfit, which neighbouring points share.
-    is_white = deviations <= _SURE
     # Of noise it is 1, with a standard deviation of sqrt(2 / freedom).
-    is_small = bool(reduced < 1 + _SURE * np.sqrt(2 / freedom))
-    return correlation, is_white and (is_small or not stated)
+    chance = _SURE * np.sqrt(2 / freedom)
+    if stated and reduced > 1 - chance:
+        return correlation, bool(reduced < 1 + chance)
+    # A noise that was found makes chi-square over its degrees of freedom 1, and one that
+    # was stated too large may hide a misfit, which neighbouring points share.
+    return correlation, deviations <= _SURE
 
 
 def _correlation(

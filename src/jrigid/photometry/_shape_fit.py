@@ -132,7 +132,8 @@ class ShapeFit:
         correlation: Of the residuals at neighbouring points of a curve. It is near 0
             for noise, and near 1 for a light curve that is missed.
         follows: Whether the fit follows the curves to their noise, as far as it is
-            known: if it is not stated, the residuals need only be uncorrelated.
+            known. If it is not stated, or stated too large, the residuals need only be
+            uncorrelated.
         is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
             holds what the model misses.
         is_at_limit: Whether the moments are those of a flat or a round body, at the

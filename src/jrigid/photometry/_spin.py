@@ -52,7 +52,7 @@ from jrigid.photometry._spin_search import (
     STRIDE,
     Spins,
     best,
-    neighbours,
+    minima_about,
     search_spins,
     settled,
 )
@@ -106,10 +106,11 @@ class Spin:
             law. The sum of the areas is that of a unit sphere. The moments of inertia
             are not known and have no effect: they are given as equal.
         estimates: Its period, pole and scattering.
-        errors: Their standard errors, near this minimum of chi-square: they know
-            nothing of other solutions. They hold if the errors of the points are
-            independent and the surface is as assumed, and are enlarged where chi-square
-            is too large.
+        errors: Their standard errors: root mean square distances from this minimum of
+            chi-square in a mixture of normal distributions, one about each minimum that
+            was found within a quarter of a radian. They know nothing of other poles.
+            They hold if the errors of the points are independent and the surface is as
+            assumed, and are enlarged where chi-square is too large.
         chi_square: Sum of squares of the residuals over the noise, and of what the areas
             and the numbers deviate from what is expected, over its spread.
         open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
@@ -144,7 +145,8 @@ class SpinInversion:
         correlation: Of the best solution's residuals at neighbouring points of a curve.
             It is near 0 for noise, and near 1 for a light curve that is missed.
         follows: Whether the best solution follows the curves to their noise, as far as
-            it is known: if it is not stated, its residuals need only be uncorrelated.
+            it is known. If it is not stated, or stated too large, its residuals need
+            only be uncorrelated.
         is_noise_found: Whether the noise was not stated: it is what the fit leaves, and
             holds what the model misses.
     """
@@ -395,11 +397,9 @@ def _inversion(
     scale = max(reduced, 1.0)
     unlike = best(spins, len(spins.numbers))
     every = []
-    for i in range(len(unlike.numbers)):
-        one = rows_of(unlike, [i])
+    for group in minima_about(spins, unlike):
         minima = [
-            _spin(rows_of(spins, [k]), surface, readings, scale)
-            for k in neighbours(spins, one).tolist()
+            _spin(rows_of(spins, [k]), surface, readings, scale) for k in group.tolist()
         ]
         every.append(_with_spread(minima, scale))
     growth = (unlike.quadratic.chi_square - unlike.quadratic.chi_square[0]) / scale
@@ -422,7 +422,8 @@ def _inversion(
 def _with_spread(minima: list[Spin], scale: float) -> Spin:
     """The best of the minima about a pole, with errors that hold the others.
 
-    They are those of a mixture of normal distributions, one about each minimum.
+    They are root mean square distances from it in a mixture of normal distributions, one
+    about each minimum.
     """
     lowest = min(minima, key=lambda spin: spin.chi_square)
     growth = np.array([(x.chi_square - lowest.chi_square) / scale for x in minima])

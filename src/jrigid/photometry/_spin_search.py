@@ -171,6 +171,20 @@ def neighbours(spins: Spins, one: Spins) -> Int[np.ndarray, " near"]:
     return np.flatnonzero((turns <= _APART) & (apart <= _APART_IN_POLE))
 
 
+def minima_about(spins: Spins, poles: Spins) -> list[Int[np.ndarray, " minima"]]:
+    """Indices of the minima about each of some poles, which are in the order of merit.
+
+    A minimum between two poles belongs to the better one.
+    """
+    groups = []
+    left_over = np.ones(len(spins.numbers), bool)
+    for i in range(len(poles.numbers)):
+        near = neighbours(spins, rows_of(poles, [i]))
+        groups.append(near[left_over[near]])
+        left_over[near] = False
+    return groups
+
+
 def starts(
     surface: Surface, lowest: float, highest: float
 ) -> tuple[AnyArray, AnyArray]:

@@ -160,9 +160,10 @@ def _starting_vectors(
     return rows
 
 
-def _findings(motion: Motion, rows: Array) -> Findings:
+def _findings(motion: Motion, rows: Array, given: bool) -> Findings:
     """What is wrong with the values of a motion and of its starting vectors."""
     findings = findings_of(motion)
+    rows = _scaled(walk(motion, 1, findings.ok), rows, given)
     message = (
         "Arguments `vector(s)` must be finite and linearly independent, but they are "
         "not."
@@ -170,6 +171,11 @@ def _findings(motion: Motion, rows: Array) -> Findings:
     independent = _are_independent(rows, orthonormal(rows)[1])
     findings.require(independent, RESULTS.invalid_state, message)
     return findings
+
+
+def _scaled(path: Walk, rows: Array, given: bool) -> Array:
+    """Starting vectors in the scales of the motion; those given are in SI units."""
+    return rows / path.units_of_tangents[None] if given else rows
 
 
 def _are_independent(rows: Array, lengths: Array) -> Array:
@@ -243,9 +249,9 @@ class _Indicators(NamedTuple):
 def _indicators(
     motion: Motion, schedule: _Schedule, rows: Array, given: bool
 ) -> _Indicators:
-    findings = _findings(motion, rows)
+    findings = _findings(motion, rows, given)
     path = walk(motion, schedule.total, findings.ok)
-    rows = rows / path.units_of_tangents[None] if given else rows
+    rows = _scaled(path, rows, given)
     y = path.with_tangents(path.start, orthonormal(rows)[0])
 
     def follow(path: Walk, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -280,8 +286,9 @@ def _settled_indicators(
 ) -> _Indicators:
     """Both indicators of a motion, or an error."""
     rows = _starting_vectors(motion, vectors, count)
-    indicators = _indicators(motion, schedule, rows, vectors is not None)
-    return settle(indicators, throw, _findings, motion, rows)
+    given = vectors is not None
+    indicators = _indicators(motion, schedule, rows, given)
+    return settle(indicators, throw, _findings, motion, rows, given)
 
 
 def lyapunov_spectrum(
