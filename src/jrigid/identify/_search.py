@@ -512,17 +512,15 @@ def _off_zero(case: Case, best: Fit) -> Search:
     to be zero.
     """
     before = best.minimum
-    stage = stages_of(case, slow=False)[-1]._replace(steps=1)
-    settings = _settings(stage, best.kept, best.scales, best.disturbance)
+    point = before.point
     # Single precision does not hold such small slopes beside those of other numbers.
     single = before.units.dtype == np.float32
     for least in _SMALL[:1] if single else _SMALL:
-        point = before.point
         numbers, own = best.problem.unknowns.off_zero(point.numbers, point.own, least)
         if np.array_equal(numbers, point.numbers) and np.array_equal(own, point.own):
             return best
         moved = point._replace(numbers=numbers, own=own)
-        minimum = yield Request(best.problem, best.layout, moved, settings)
+        minimum = yield _evaluation(case, best, best.problem, moved)
         fit = dataclasses.replace(
             best, minimum=minimum._replace(settled=before.settled), computed={}
         )
@@ -530,6 +528,14 @@ def _off_zero(case: Case, best: Fit) -> Search:
         if rise < _NO_RISE * weakest(best).noise:
             return fit
     return best
+
+
+def _evaluation(case: Case, best: Fit, problem: Problem, point: Point) -> Request:
+    """Ask for the rows of a fit at another point."""
+    # The first step evaluates the point, and moves nothing.
+    stage = stages_of(case, slow=False)[-1]._replace(steps=1)
+    settings = _settings(stage, best.kept, best.scales, best.disturbance)
+    return Request(problem, best.layout, point, settings)
 
 
 def _is_thickness_unknown(best: Fit) -> bool:
@@ -548,9 +554,6 @@ def _thicker(case: Case, best: Fit) -> Search:
     The numbers of a body are logarithms. Those that state the thickness of a flat one
     change nothing to first order, so that its own rows say nothing of their errors.
     """
-    # The first step evaluates the point, and moves nothing.
-    stage = stages_of(case, slow=False)[-1]._replace(steps=1)
-    settings = _settings(stage, best.kept, best.scales, best.disturbance)
     problem, point = _in_own_frame(best.problem, best.minimum.point)
     fit = best
     least = _FIRST_THICKNESS
@@ -559,7 +562,7 @@ def _thicker(case: Case, best: Fit) -> Search:
         numbers = point.numbers.copy()
         numbers[LOGARITHMS] = np.maximum(numbers[LOGARITHMS], least)
         at = point._replace(numbers=numbers)
-        minimum = yield Request(problem, best.layout, at, settings)
+        minimum = yield _evaluation(case, best, problem, at)
         fit = dataclasses.replace(
             best, problem=problem, minimum=minimum, probes=(), computed={}
         )

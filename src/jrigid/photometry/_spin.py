@@ -71,10 +71,10 @@ _FULL = (
     "The table is full, so that other rotations may explain the curves, too. Search a "
     "part of the range of periods at a time."
 )
-# Within a curve the phase function is nearly constant, as is the factor that a relative
-# curve leaves open.
 # Phase angles that differ by less [rad] say nothing of the phase function.
 _LEAST_ANGLES = float(np.radians(1.0))
+# Within a curve the phase function is nearly constant, as is the factor that a relative
+# curve leaves open.
 _NEEDS_SCALE = ("amplitude", "width", "slope")
 
 

@@ -163,7 +163,8 @@ def _starting_vectors(
 def _findings(motion: Motion, rows: Array, given: bool) -> Findings:
     """What is wrong with the values of a motion and of its starting vectors."""
     findings = findings_of(motion)
-    rows = _scaled(walk(motion, 1, findings.ok), rows, given)
+    if given:
+        rows = _scaled(walk(motion, 1, findings.ok), rows)
     message = (
         "Arguments `vector(s)` must be finite and linearly independent, but they are "
         "not."
@@ -173,9 +174,9 @@ def _findings(motion: Motion, rows: Array, given: bool) -> Findings:
     return findings
 
 
-def _scaled(path: Walk, rows: Array, given: bool) -> Array:
-    """Starting vectors in the scales of the motion; those given are in SI units."""
-    return rows / path.units_of_tangents[None] if given else rows
+def _scaled(path: Walk, rows: Array) -> Array:
+    """Starting vectors in SI units, in the scales of the motion."""
+    return rows / path.units_of_tangents[None]
 
 
 def _are_independent(rows: Array, lengths: Array) -> Array:
@@ -251,7 +252,7 @@ def _indicators(
 ) -> _Indicators:
     findings = _findings(motion, rows, given)
     path = walk(motion, schedule.total, findings.ok)
-    rows = _scaled(path, rows, given)
+    rows = _scaled(path, rows) if given else rows
     y = path.with_tangents(path.start, orthonormal(rows)[0])
 
     def follow(path: Walk, y: Array) -> tuple[Array, Array, Array, Array]:
