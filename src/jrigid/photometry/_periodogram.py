@@ -145,17 +145,22 @@ def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, 
         "Arguments `shortest` and `longest` must be positive periods in this order, but "
         f"they are {shortest:g} s and {longest:g} s.",
     )
-    demand(
-        bool(span > _LEAST_CYCLES * shortest),
-        "Argument `curves` must span more than half of `shortest`, but they span "
-        f"{span:.4g} s.",
-    )
+    check_span(span, shortest)
     demand(
         bool(span <= _MOST_CYCLES * shortest),
         f"Argument `shortest` must be at least 1 / {_MOST_CYCLES} of the time that the "
         f"curves span, {span:.4g} s, but it is {shortest:g} s: are periods in seconds?",
     )
     return span / longest, span / shortest
+
+
+def check_span(span: float, shortest: float) -> None:
+    """Raise ValueError for curves that say nothing of the shortest period."""
+    demand(
+        bool(span > _LEAST_CYCLES * shortest),
+        "Argument `curves` must span more than half of `shortest`, but they span "
+        f"{span:.4g} s.",
+    )
 
 
 def frequency_pairs(

@@ -32,6 +32,7 @@ from jrigid.photometry._facets import Facets
 from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
 from jrigid.photometry._model import axes_of_momentum
+from jrigid.photometry._periodogram import check_span
 from jrigid.photometry._polyhedron import MOST_OPEN, mesh_from_facets
 from jrigid.photometry._readings import (
     Readings,
@@ -331,11 +332,7 @@ def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
         "Arguments `shortest` and `longest` must be periods in seconds in rising order, "
         f"but they are {shortest} and {longest}.",
     )
-    demand(
-        span > shortest / 2,
-        "Argument `curves` must span more than half of `shortest`, but they span "
-        f"{span:.3g} s.",
-    )
+    check_span(span, shortest)
     turns = span / longest, span / shortest
     count = (turns[1] - turns[0]) / STRIDE
     demand(
