@@ -166,12 +166,12 @@ def test_the_model_of_a_fit_is_the_light_curve_of_the_tumbler(mode, rng):
 def inversion():
     """A tumbler by DOP853 and facets, and what is found."""
     curves, truth = tumbler_reference.tumbler(np.random.default_rng(3), "long-axis")
-    programs = refine.refined._cache_size()
+    programs = refine.minimised._cache_size()
     found = ph.find_tumblers(
         curves, 0.02, shortest=8 * HOUR, longest=400 * HOUR, pairs=25
     )
     # One for a part of the epochs and one for all, whatever the number of steps.
-    assert refine.refined._cache_size() <= programs + 2
+    assert refine.minimised._cache_size() <= programs + 2
     return curves, truth, found
 
 

@@ -13,6 +13,7 @@ from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix, Scalar, Vector
 from jrigid.photometry._ellipsoid import lommel_seeliger_brightness
 from jrigid.photometry._readings import Readings
+from jrigid.photometry._refine import Quadratic
 from jrigid.photometry._wobble import Wobble, body_axes, wobble
 
 
@@ -268,4 +269,17 @@ def rows_of(vector: Float[Array, "11"], task: Task, readings: Readings) -> Rows:
     return Rows(
         residuals=jnp.append(readings.values - readings.projected(model), gap),
         slopes=jnp.concatenate([-projected, gap_slopes[None]]),
+    )
+
+
+def tumbler_quadratic(
+    vector: Float[Array, "11"], task: Task, readings: Readings
+) -> Quadratic:
+    """Chi-square of one lane and its derivatives in the numbers that it seeks."""
+    rows, slopes = rows_of(vector, task, readings)
+    slopes = jnp.where(sought(task), slopes, 0.0)
+    return Quadratic(
+        chi_square=product("r,r->", rows, rows),
+        slope=product("rn,r->n", slopes, rows),
+        normal=product("rn,rm->nm", slopes, slopes),
     )

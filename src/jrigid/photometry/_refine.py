@@ -1,25 +1,21 @@
 """Levenberg-Marquardt for many starting points at once."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
 from jrigid._numerics import product
 from jrigid._types import AnyArray
-from jrigid.photometry._model import Task, rows_of, sought
-from jrigid.photometry._readings import Readings
 
 _FIRST_DAMPING = 1e-2
 _LEAST_DAMPING = 1e-9
-# Above this much damping no step helps.
-_STUCK = 1e8
-_FALL = 0.2  # of the damping after a step that helps
-_RISE = 4.0  # after one that does not
-# A lane has converged where a nearly undamped step gains less of chi-square than this.
-_ENOUGH = 1e-4
+_STUCK = 1e12  # above this much damping no step helps
+# A lane has converged where a nearly undamped step promises less of chi-square.
+_ENOUGH = 1e-3
 _UNDAMPED = 1e-2
 # Least diagonal of the normal equations: a number of no effect stays where it is.
 _FLOOR = 1e-12
@@ -34,76 +30,93 @@ class Quadratic(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """The best points so far and what comes next."""
+    """The best points so far and what comes next.
 
-    numbers: Float[Array, "lanes 11"]
+    Attributes:
+        numbers: The best point of each lane.
+        at: Chi-square about it.
+        damping: Of the next step.
+        rise: Factor of the damping if the next step fails.
+        going: Whether the search goes on.
+        steps: How many steps were taken.
+    """
+
+    numbers: Float[Array, "lanes numbers"]
     at: Quadratic
     damping: Float[Array, " lanes"]
+    rise: Float[Array, " lanes"]
     going: Bool[Array, " lanes"]
     steps: Int[Array, ""]
 
 
-def quadratic(vector: Float[Array, "11"], task: Task, readings: Readings) -> Quadratic:
-    """Chi-square of one lane and its derivatives in the numbers that it seeks."""
-    rows, slopes = rows_of(vector, task, readings)
-    slopes = jnp.where(sought(task), slopes, 0.0)
-    return Quadratic(
-        chi_square=product("r,r->", rows, rows),
-        slope=product("rn,r->n", slopes, rows),
-        normal=product("rn,rm->nm", slopes, slopes),
-    )
-
-
-@jax.jit
-def refined(
-    numbers: Float[Array, "lanes 11"],
-    tasks: Task,
-    readings: Readings,
+@functools.partial(jax.jit, static_argnames="quadratic")
+def minimised(
+    quadratic: Callable[..., Quadratic],
+    numbers: Float[Array, "lanes numbers"],
+    tasks: PyTree,
+    shared: tuple[PyTree, ...],
     steps: Int[ArrayLike, ""],
-) -> tuple[Float[Array, "lanes 11"], Quadratic]:
-    """Minimise chi-square in each lane.
+) -> tuple[Float[Array, "lanes numbers"], Quadratic]:
+    """Levenberg-Marquardt in all lanes, with the damping of Nielsen.
+
+    A damping that heeds how well a step was predicted takes half of the steps that one
+    with fixed factors takes.
 
     Args:
+        quadratic: Chi-square about the numbers of a lane, a function of these numbers,
+            of the task of the lane, and of what is shared.
         numbers: Starting points.
-        tasks: One for each lane.
-        readings: The light curves, the same for all.
+        tasks: What `quadratic` takes second, with lanes in front.
+        shared: What it takes then, the same for all lanes.
         steps: The largest number of steps; one program serves all.
 
-    Source: J. J. More, Lecture Notes in Mathematics 630 (1978) 105.
+    Source: K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least
+    squares problems, 2nd ed., 2004, algorithm 3.16.
     """
-    evaluate = jax.vmap(quadratic, (0, 0, None))
-    start = evaluate(numbers, tasks, readings)
+    each = jax.vmap(lambda x, task: quadratic(x, task, *shared))
+
+    def evaluate(numbers: Array) -> Quadratic:
+        return each(numbers, tasks)
+
+    def next_loop(loop: _Loop) -> _Loop:
+        return _iteration(loop, evaluate)
+
+    def is_going(loop: _Loop) -> Array:
+        return jnp.any(loop.going) & (loop.steps < steps)
+
+    start = evaluate(numbers)
     loop = _Loop(
         numbers=numbers,
         at=start,
-        damping=jnp.full(len(numbers), _FIRST_DAMPING, numbers.dtype),
+        damping=jnp.full_like(start.chi_square, _FIRST_DAMPING),
+        rise=jnp.full_like(start.chi_square, 2.0),
         going=jnp.isfinite(start.chi_square),
         steps=jnp.asarray(0),
     )
-    found = jax.lax.while_loop(
-        lambda loop: jnp.any(loop.going) & (loop.steps < steps),
-        lambda loop: _iteration(loop, lambda x: evaluate(x, tasks, readings)),
-        loop,
-    )
+    found = jax.lax.while_loop(is_going, next_loop, loop)
     return found.numbers, found.at
 
 
 def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     """Try a damped step in all lanes, and keep the better points."""
-    moves = jax.vmap(damped_step)(loop.at, loop.damping)
+    moves = jax.vmap(_damped_step)(loop.at, loop.damping)
     numbers = loop.numbers + moves
     new = evaluate(numbers)
+    # A step m changes chi-square of the quadratic model by 2 m.s + m.N m, since the
+    # slope s is half its gradient.
+    bent = product("ln,lnm,lm->l", moves, loop.at.normal, moves)
+    predicted = -2 * product("ln,ln->l", moves, loop.at.slope) - bent
+    gain = loop.at.chi_square - new.chi_square
     # Chi-square may be finite where its derivatives are not, and the next step needs
     # both.
     finite = jnp.isfinite(new.chi_square) & jnp.all(
         jnp.isfinite(new.normal), axis=(1, 2)
     )
-    gain = loop.at.chi_square - new.chi_square
-    # A gain of 0 counts: else a lane at its minimum would go on until it is stuck.
-    better = loop.going & finite & (gain >= 0)
-    factor = jnp.where(better, _FALL, _RISE)
-    damping = jnp.maximum(loop.damping * factor, _LEAST_DAMPING)
-    converged = better & (gain < _ENOUGH) & (loop.damping <= _UNDAMPED)
+    better = loop.going & finite & (gain > 0)
+    ratio = jnp.where(better, gain / predicted, 0.0)
+    fall = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+    damping = loop.damping * jnp.where(better, fall, loop.rise)
+    promising = (predicted > _ENOUGH) | (loop.damping > _UNDAMPED)
 
     def chosen(a: Array, b: Array) -> Array:
         return jnp.where(better.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
@@ -111,13 +124,14 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
     return _Loop(
         numbers=chosen(numbers, loop.numbers),
         at=jax.tree.map(chosen, new, loop.at),
-        damping=damping,
-        going=loop.going & ~converged & (damping < _STUCK),
+        damping=jnp.maximum(damping, _LEAST_DAMPING),
+        rise=jnp.where(better, 2.0, 2 * loop.rise),
+        going=loop.going & promising & (damping < _STUCK),
         steps=loop.steps + 1,
     )
 
 
-def damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, " numbers"]:
+def _damped_step(at: Quadratic, damping: Float[Array, ""]) -> Float[Array, " numbers"]:
     """The step of Levenberg and Marquardt, with More's scaling by the diagonal."""
     diagonal = jnp.maximum(jnp.diagonal(at.normal), _FLOOR)
     # In units in which the diagonal is 1 the equations are well scaled.

@@ -18,12 +18,13 @@ from jrigid.photometry._model import (
     gap_of_periods,
     logits_of,
     motion_of,
+    tumbler_quadratic,
     unpacked,
 )
 from jrigid.photometry._periodogram import frequency_pairs, strongest_lines, unlike
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
-from jrigid.photometry._refine import Quadratic, refined
+from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scan import (
     ANGLES,
     fewer_epochs,
@@ -370,9 +371,10 @@ def _minimised(
     readings: Readings, numbers: np.ndarray, tasks: Task, steps: int
 ) -> Found:
     """The points after so many steps, those that are finite."""
-    minimise: Callable[..., tuple[Array, Quadratic]] = refined
-    numbers, quadratic = in_batches(
-        _LANES, lambda x, y: minimise(x, y, readings, steps=steps), numbers, tasks
-    )
+
+    def of_batch(numbers: np.ndarray, tasks: Task) -> tuple[Array, Quadratic]:
+        return minimised(tumbler_quadratic, numbers, tasks, (readings,), steps)
+
+    numbers, quadratic = in_batches(_LANES, of_batch, numbers, tasks)
     found = Found(numbers, tasks, quadratic)
     return rows_of(found, np.flatnonzero(np.isfinite(quadratic.chi_square)))

@@ -53,7 +53,7 @@ from jrigid.photometry._readings import (
     readings_of,
     stated_noise,
 )
-from jrigid.photometry._refine import Quadratic
+from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin import (
     FIRST_NOISE,
@@ -62,7 +62,7 @@ from jrigid.photometry._spin import (
     freedom,
     of_surface,
 )
-from jrigid.photometry._spin_search import SEARCHED_FACETS, frame_of_pole, minimised
+from jrigid.photometry._spin_search import SEARCHED_FACETS, frame_of_pole
 from jrigid.photometry._tumbler import Tumbler
 from jrigid.photometry._tumbling import tumbling
 
@@ -359,13 +359,12 @@ def _minimum(
 ) -> tuple[np.ndarray, Quadratic]:
     """The numbers of least chi-square near a start, and chi-square about them."""
     lane = jax.tree.map(lambda x: x[None], task)
-    steps = np.asarray(_STEPS)
     numbers = start[None]
     quadratic = None
     for link in links:
         linked = lane._replace(link=np.asarray([link]))
         numbers, quadratic = minimised(
-            _quadratic, numbers, linked, surface, readings, steps
+            _quadratic, numbers, linked, (surface, readings), _STEPS
         )
     return jax.tree.map(lambda x: np.asarray(x)[0], (numbers, quadratic))
 

@@ -1,17 +1,12 @@
 """The search for steady rotations that explain light curves."""
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jrigid._checks import demand
 from jrigid._core.host_rows import in_batches, joined, rows_of
-from jrigid._numerics import product
 from jrigid._types import AnyArray
 from jrigid.photometry._convex import (
     FIRST_AXES,
@@ -26,7 +21,7 @@ from jrigid.photometry._convex import (
 from jrigid.photometry._periodogram import shared_places
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._readings import Readings
-from jrigid.photometry._refine import Quadratic, damped_step
+from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scan import fewer_epochs
 
 # Chi-square has a minimum about every half turn within the span: half turns of an
@@ -64,12 +59,6 @@ _COARSE_LANES = 32
 # A processor gains nothing by more lanes of the full body at once, and all lanes wait
 # for the slowest.
 _LANES = 1
-_FIRST_DAMPING = 1e-2
-_LEAST_DAMPING = 1e-9
-_STUCK = 1e12  # above this much damping no step helps
-# A lane has converged where a nearly undamped step promises less of chi-square.
-_ENOUGH = 1e-2
-_UNDAMPED = 1e-2
 
 
 class Spins(NamedTuple):
@@ -251,101 +240,7 @@ def minimise(
     """The points after so many steps, so many lanes at a time."""
 
     def of_batch(numbers: np.ndarray, frames: np.ndarray) -> Spins:
-        result = minimised(
-            spin_quadratic, numbers, frames, surface, readings, np.asarray(steps)
-        )
+        result = minimised(spin_quadratic, numbers, frames, (surface, readings), steps)
         return Spins(result[0], frames, result[1])
 
     return in_batches(lanes, of_batch, numbers, frames)
-
-
-class _Loop(NamedTuple):
-    """The best points so far and what comes next."""
-
-    numbers: Float[Array, "lanes numbers"]
-    at: Quadratic
-    damping: Float[Array, " lanes"]
-    rise: Float[Array, " lanes"]
-    going: Bool[Array, " lanes"]
-    steps: Int[Array, ""]
-
-
-@functools.partial(jax.jit, static_argnames="quadratic")
-def minimised(
-    quadratic: Callable[[Array, Any, Surface, Readings], Quadratic],
-    numbers: Float[Array, "lanes numbers"],
-    tasks: Any,
-    surface: Surface,
-    readings: Readings,
-    steps: Int[Array, ""],
-) -> tuple[Float[Array, "lanes numbers"], Quadratic]:
-    """Levenberg-Marquardt in all lanes, with the damping of Nielsen.
-
-    The areas are exponentials of the numbers, and a damping that heeds how well a step
-    was predicted takes half of the steps that one with fixed factors takes.
-
-    Args:
-        quadratic: Chi-square about the numbers of a lane.
-        numbers: Starting points.
-        tasks: What `quadratic` takes second, with lanes in front.
-        surface: What it takes third, the same for all lanes.
-        readings: The light curves.
-        steps: The largest number of steps; one program serves all.
-
-    Source: K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least
-    squares problems, 2nd ed., 2004, algorithm 3.16.
-    """
-    each = jax.vmap(quadratic, (0, 0, None, None))
-
-    def evaluate(numbers: Array) -> Quadratic:
-        return each(numbers, tasks, surface, readings)
-
-    def next_loop(loop: _Loop) -> _Loop:
-        return _iteration(loop, evaluate)
-
-    def is_going(loop: _Loop) -> Array:
-        return jnp.any(loop.going) & (loop.steps < steps)
-
-    start = evaluate(numbers)
-    loop = _Loop(
-        numbers=numbers,
-        at=start,
-        damping=jnp.full_like(start.chi_square, _FIRST_DAMPING),
-        rise=jnp.full_like(start.chi_square, 2.0),
-        going=jnp.isfinite(start.chi_square),
-        steps=jnp.zeros_like(steps),
-    )
-    found = jax.lax.while_loop(is_going, next_loop, loop)
-    return found.numbers, found.at
-
-
-def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
-    """Try a damped step in all lanes, and keep the better points."""
-    moves = jax.vmap(damped_step)(loop.at, loop.damping)
-    numbers = loop.numbers + moves
-    new = evaluate(numbers)
-    # A step m changes chi-square of the quadratic model by 2 m.s + m.N m, since the
-    # slope s is half its gradient.
-    bent = product("ln,lnm,lm->l", moves, loop.at.normal, moves)
-    predicted = -2 * product("ln,ln->l", moves, loop.at.slope) - bent
-    gain = loop.at.chi_square - new.chi_square
-    finite = jnp.isfinite(new.chi_square) & jnp.all(
-        jnp.isfinite(new.normal), axis=(1, 2)
-    )
-    better = loop.going & finite & (gain > 0)
-    ratio = jnp.where(better, gain / predicted, 0.0)
-    fall = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
-    damping = loop.damping * jnp.where(better, fall, loop.rise)
-    promising = (predicted > _ENOUGH) | (loop.damping > _UNDAMPED)
-
-    def chosen(a: Array, b: Array) -> Array:
-        return jnp.where(better.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
-
-    return _Loop(
-        numbers=chosen(numbers, loop.numbers),
-        at=jax.tree.map(chosen, new, loop.at),
-        damping=jnp.maximum(damping, _LEAST_DAMPING),
-        rise=jnp.where(better, 2.0, 2 * loop.rise),
-        going=loop.going & promising & (damping < _STUCK),
-        steps=loop.steps + 1,
-    )
