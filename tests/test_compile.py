@@ -177,3 +177,38 @@ def test_functions_of_rotations_are_one_program(programs, function):
     argument = np.eye(3) if of_matrix else np.array([0.6, 0.0, 0.8, 0.0])
     function(argument)
     assert programs() == 1
+
+
+def drag(t, state, args):
+    return -args * state.omega
+
+
+def final_rate(coefficient):
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), drag)
+    return jr.simulate(body, SPINNING, 1.0, coefficient).final_state.omega
+
+
+def largest_exponent(coefficient):
+    body = jr.RigidBody(np.array([1.0, 2.0, 3.0]), drag)
+    return jr.stability.megno(body, SPINNING, 1.0, 20, args=coefficient).exponent
+
+
+def above(x, coefficient):
+    return x - coefficient
+
+
+def root(coefficient):
+    return jr.stability.boundary(above, 0.0, 1.0, coefficient)
+
+
+SPINNING = jr.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.1, 1.0, 0.2]))
+
+
+@pytest.mark.parametrize("function", [final_rate, largest_exponent, root])
+def test_another_float_in_args_is_not_compiled_anew(function, programs):
+    first = function(0.3)
+    compiled = programs()
+    assert compiled > 0
+    second = function(0.4)
+    assert programs() == compiled
+    assert np.max(np.abs(np.asarray(first - second))) > 1e-3

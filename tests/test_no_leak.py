@@ -40,9 +40,7 @@ def crossing(t, state):
 
 
 def simulate(state, breaks_at):
-    # Of Python's numbers each is compiled for itself.
-    body = jr.RigidBody(MOMENTS, broken)
-    return jr.simulate(body, state, TIMES, np.asarray(breaks_at))
+    return jr.simulate(jr.RigidBody(MOMENTS, broken), state, TIMES, breaks_at)
 
 
 def free_rotation_lanes(sign):
@@ -77,7 +75,7 @@ def above(x, least):
 
 
 def boundary(least):
-    return jr.stability.boundary(above, 0.0, 1.0, np.asarray(least))
+    return jr.stability.boundary(above, 0.0, 1.0, least)
 
 
 def fit(rates):

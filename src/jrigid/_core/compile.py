@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
@@ -179,6 +180,19 @@ def one_program(
         return function(*args, **kwargs)
 
     return call
+
+
+def floats_as_arrays(tree: Any, dtype: Any) -> Any:
+    """The tree with arrays in place of Python's floats.
+
+    `equinox.filter_jit` takes a Python float for a constant, and compiles anew for each
+    value.
+    """
+
+    def convert(x: Any) -> Any:
+        return jnp.asarray(x, dtype) if isinstance(x, float) else x
+
+    return jtu.tree_map(convert, tree)
 
 
 def _as_array(x: Any) -> Any:

@@ -15,10 +15,11 @@ from jaxtyping import Array, PyTree
 from jaxtyping import ArrayLike as _ArrayLike
 
 from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
-from jrigid._core.compile import quick_jit
+from jrigid._core.compile import floats_as_arrays, quick_jit
 from jrigid._motion import HasRigidBody, motion_arguments
 from jrigid._stepping.derivatives import (
     moved_by,
+    moved_in_a_step,
     solve_direct,
     solve_forward,
     solve_reverse,
@@ -98,7 +99,8 @@ def simulate(
         ts: Times [s] of any shape, non-decreasing in the order of their memory, none
             before `t0`. Their dtype may be more precise than the state's. It must be
             where `t0` is far from 0, such as the seconds since 1970.
-        args: Passed to torques and forces.
+        args: Passed to torques and forces. Python floats become arrays, so that other
+            values need no compilation.
         t0: Time of `state0` [s].
         solver: A diffrax solver with an error estimate; `jrigid.solvers.Verner9()` by
             default. An implicit one (`diffrax.Kvaerno5()`) steps over motions that drag
@@ -179,6 +181,7 @@ def simulate(
     Argument `state0` must be finite, but a component is not.
     """
     body, state0, (ts, t0) = motion_arguments(system, state0, ts=ts, t0=t0)
+    args = floats_as_arrays(args, state0.omega.dtype)
     jumps = jumps_of(body, jumps, ts.dtype)
     requested = Requested(
         solver, rtol, atol, adjoint, max_steps, max_step, event, progress
@@ -303,7 +306,7 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
         given.field, motion, given.omega, options, event
     )
     result: Any = RESULTS.promote(result)
-    ys = _with_derivatives_in_times(given, motion.times, ys)
+    ys = _with_derivatives_in_times(given, options, motion.times, ys)
     if event is None:
         complete = result == RESULTS.successful
         t, y = _end_without_event(motion.times, t, y, ys, complete)
@@ -351,7 +354,7 @@ def _integrated(
     ends = solve(engine, motion)
     ys = ends.ys
     if conditions is None:
-        ys = _with_derivatives_in_times(given, given.times, ys)
+        ys = _with_derivatives_in_times(given, options, given.times, ys)
         complete = ends.counts[0] == ENDED
         t = jax.lax.stop_gradient(ends.t)
         t, y = _end_without_event(given.times, t, ends.y, ys, complete)
@@ -362,16 +365,20 @@ def _integrated(
         number = jnp.arange(given.times.size, dtype=ends.counts.dtype)
         missing = (number >= ends.counts[3]) & (given.times <= t)
         ys = jnp.where(missing[:, None], ends.y[None], ys)
-        ys = _with_derivatives_in_times(given, given.times, ys)
+        ys = _with_derivatives_in_times(given, options, given.times, ys)
     reached = jax.lax.stop_gradient(given.times) <= jax.lax.stop_gradient(t)
     result = _result_of(ends.counts[0])
     return _Solved(ys, reached, t, y, result, ends.counts[1], ends.counts[2])
 
 
-def _with_derivatives_in_times(given: Prepared, times: Array, ys: Array) -> Array:
+def _with_derivatives_in_times(
+    given: Prepared, options: Options, times: Array, ys: Array
+) -> Array:
     """States at the output times, whose derivatives in these times are the rates."""
     fixed = jax.lax.stop_gradient(times)
-    later = jax.vmap(partial(moved_by, given.field, given.parameters))
+    is_direct = isinstance(options.adjoint, diffrax.DirectAdjoint)
+    moved = moved_in_a_step if is_direct else moved_by
+    later = jax.vmap(partial(moved, given.field, given.parameters))
     # The difference is zero, but its derivatives are those of the times.
     return later(fixed, ys, times - fixed)
 

@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import Findings, all_finite, array_of_shape, demand, shaped
+from jrigid._core.compile import floats_as_arrays
 from jrigid._types import Scalar, ScalarLike
 from jrigid.sweep import SweepResult, sweep
 
@@ -132,12 +133,12 @@ def boundary(
     2.0
     """
     lower, upper = shaped(lower=(lower,), upper=(upper,))
+    args = floats_as_arrays(args, lower.dtype)
     fixed = jtu.tree_map(
         lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, args
     )
     ends = jax.lax.stop_gradient(jnp.stack([lower, upper]))
-    values = [array_of_shape("function", function(x, *fixed)) for x in ends]
-    known = jax.lax.stop_gradient(jnp.stack(values).astype(lower.dtype))
+    known = jax.lax.stop_gradient(_values(function, ends, fixed))
     # A zero at an end of the interval is a boundary, too.
     ok = all_finite(known) & (jnp.sign(known[0]) * jnp.sign(known[1]) <= 0)
     falls = known[0] > known[1]
@@ -163,6 +164,18 @@ def boundary(
         ok & (left <= _ROOT * jnp.max(jnp.abs(known))), None, message, ends
     )
     return findings.guard(lower + (upper - lower) * place, throw)
+
+
+@eqx.filter_jit
+def _values(function: Callable[..., Any], points: Array, args: Any) -> Array:
+    """The function at several points; a loop compiles it once, not once for each."""
+
+    def value(point: Array) -> Array:
+        return jnp.asarray(
+            array_of_shape("function", function(point, *args)), points.dtype
+        )
+
+    return jax.lax.map(value, points)
 
 
 def _rising(

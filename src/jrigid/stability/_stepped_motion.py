@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, all_positive, nan_where
+from jrigid._core.compile import floats_as_arrays
 from jrigid._motion import (
     check_motion,
     harmless_motion,
@@ -60,6 +61,7 @@ def motion_of(
     )
     t0, duration = (x.astype(state0.omega.dtype) for x in times)
     solver = solver_of(solver, diffrax.Dopri8())
+    args = floats_as_arrays(args, state0.omega.dtype)
     return Motion(system, state0, args, t0, duration, solver)
 
 
