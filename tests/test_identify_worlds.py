@@ -213,6 +213,30 @@ def test_gyrostat_takes_many_trials_and_states_its_errors(rng):
 # The posterior
 
 
+def test_the_log_density_has_a_gradient_under_a_torque(rng):
+    """That of its values, by central differences."""
+    ts = np.linspace(0.0, 4.0, 60)
+    body = jr.RigidBody(TENSOR, jr.torques.LinearDrag(0.05))
+    start = jr.State(np.array([1.0, 0, 0, 0]), OMEGA)
+    values = np.asarray(jr.simulate(body, start, ts).states.omega)
+    record = identify.Rates(ts, values + 0.01 * rng.normal(size=(60, 3)), 0.01)
+    blind = jr.RigidBody(np.eye(3), jr.torques.LinearDrag(0.02))
+    found = identify.fit(blind, record, free=lambda body, _: body.torque.coefficient)
+    density = identify.log_density(found)
+    value_and_slope = quick_jit(jax.value_and_grad(density.function))
+    # Off the maximum, where the slope is several errors long.
+    place = density.start + 3 * np.sqrt(np.diagonal(density.covariance))
+    slope = value_and_slope(place)[1]
+    steps = 1e-3 * np.sqrt(np.diagonal(density.covariance))
+    for k, step in enumerate(steps):
+        move = step * np.eye(len(steps))[k]
+        ahead, _ = value_and_slope(place + move)
+        behind, _ = value_and_slope(place - move)
+        assert float(slope[k] * step) == pytest.approx(
+            float(ahead - behind) / 2, rel=1e-4, abs=1e-6
+        )
+
+
 def test_the_log_density_has_the_fit_s_minimum_and_curvature(rng):
     """Its gradient at the fit is that of the priors' Jacobians, small beside the errors."""
     motion = jr.free_rotation(TENSOR, jr.State(np.array([1.0, 0, 0, 0]), OMEGA), TS)

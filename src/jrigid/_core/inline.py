@@ -15,6 +15,9 @@ def inlined(function: Callable[..., Any], *arguments: Any) -> Any:
     Under nested vmaps JAX traces each call of a jitted function, such as `jnp.where`,
     once for every vmap. Here the function is traced once by itself, and the vmaps see
     its operations only. This halves the time to trace a fit.
+
+    Gradients: those of the operations. Rules of functions that have derivatives of
+    their own (`jax.custom_jvp` and the like) are lost.
     """
     leaves, structure = jtu.tree_flatten(arguments)
     shapes = [

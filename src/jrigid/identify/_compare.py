@@ -23,6 +23,7 @@ from jrigid.systems import RigidBody
 _LEAST = 1e-3
 _HEADS = ("chi-square", "freedom", "unknowns", "AIC", "BIC")
 _WIDTH = 12  # of a column
+_HUGE = 1e8
 
 
 class Comparison(NamedTuple):
@@ -64,7 +65,11 @@ class Comparison(NamedTuple):
 
 
 def _cell(number: Array) -> str:
-    return f"{number.item():.1f}" if number.dtype.kind == "f" else str(number)
+    """A number with one decimal; a huge one in digits that fit the column."""
+    if number.dtype.kind != "f":
+        return str(number)
+    value = number.item()
+    return f"{value:.1f}" if abs(value) < _HUGE else f"{value:.3g}"
 
 
 def _line(name: str, width: int, cells: Sequence[str]) -> str:

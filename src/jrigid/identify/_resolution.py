@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid._core.compile import small_program
+from jrigid._core.inline import inlined
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.identify._host import conjugate, log, multiply
@@ -51,7 +52,7 @@ def _states_after(
         after = flow(problem.options, system, nodes, layout.start, layout.end, steps)
         return after.attitude, after.omega
 
-    return over_trials(trial, problem, layout)(point)
+    return over_trials(partial(inlined, trial), problem, layout)(point)
 
 
 def _to_last_samples(layout: Layout, seen: np.ndarray) -> Layout:

@@ -23,7 +23,11 @@ from jrigid.identify._flow import forced_flow, needs_attitude
 from jrigid.identify._host import on_host
 from jrigid.identify._inputs import judge
 from jrigid.identify._problem import Options, shown_by, whitened
-from jrigid.identify._readings import direct_readings_of, longest_turn
+from jrigid.identify._readings import (
+    DirectReadings,
+    direct_readings_of,
+    longest_turn,
+)
 from jrigid.identify._records import Record, Samples, of_trials, samples_of
 from jrigid.identify._sensors import AbstractSensor
 from jrigid.rotation import exp, multiply
@@ -369,43 +373,6 @@ def _cut(record: Record, windows: Sequence[_Window]) -> Record:
     return eqx.tree_at(arrays, record, segments, is_leaf=lambda x: x is None)
 
 
-class _Observed(NamedTuple):
-    """What segments show of their states.
-
-    Attributes:
-        segments: The segments, None where no state is observed.
-        has_attitude: Whether attitudes are observed.
-        turn: The largest turn between two samples [rad].
-    """
-
-    segments: _Segments | None
-    has_attitude: bool
-    turn: float
-
-
-@np.errstate(all="ignore")  # values that are bad or out of range
-def _observed(system: RigidBody, records: tuple[Record, ...]) -> _Observed:
-    records = on_host(records)
-    samples = samples_of(records, np.ones((), records[0].values.dtype))
-    readings = direct_readings_of(records, samples, None)
-    judge((system,), records, None, None, readings, throw=True)
-    if readings is None:
-        return _Observed(None, False, 0.0)
-    trial = np.arange(len(readings.ts))
-    # A segment begins at its first sample of any record. Where its first rate comes
-    # later, the Gauss-Newton steps make up for that.
-    first = np.argmax(readings.valid, axis=1)
-    if readings.attitude is None:
-        attitude = np.tile(np.eye(1, 4, dtype=samples.ts.dtype), (len(trial), 1))
-    else:
-        attitude = readings.attitude[trial, first]
-    return _Observed(
-        segments=_Segments(samples, State(attitude, readings.omega[trial, first])),
-        has_attitude=readings.attitude is not None,
-        turn=longest_turn(readings),
-    )
-
-
 class _Prepared(NamedTuple):
     """Segments and how their motion is computed; see `_Task`."""
 
@@ -414,33 +381,53 @@ class _Prepared(NamedTuple):
     steps: int
 
 
+@np.errstate(all="ignore")  # values that are bad or out of range
 def _prepared(system: RigidBody, records: tuple[Record, ...]) -> _Prepared:
     """Segments, checked for what training needs."""
-    observed = _observed(system, records)
+    records = on_host(records)
+    samples = samples_of(records, np.ones((), records[0].values.dtype))
+    readings = direct_readings_of(records, samples, None)
+    judge((system,), records, None, None, readings, throw=True)
     by_sensor = any(x.sensor.depends_on_attitude for x in records)
     depends_on_attitude = by_sensor or needs_attitude(system)
     state = system.with_parts(State(jnp.zeros(4), jnp.zeros(3)))
-    lacks_attitude = depends_on_attitude and not observed.has_attitude
-    if observed.segments is None or state.internal is not None or lacks_attitude:
+    lacks_attitude = depends_on_attitude and (
+        readings is None or readings.attitude is None
+    )
+    if readings is None or state.internal is not None or lacks_attitude:
         raise ValueError(
             "Argument `observations` must show the whole state, rates and, where a "
             "torque or sensor depends on them, attitudes, without parts that move "
             "inside the body, but it does not."
         )
     demand(
-        not np.any(observed.segments.samples.sign),
+        not np.any(samples.sign),
         "Argument `observations` must hold no saturated readings, but it holds some: "
         "leave out their samples.",
     )
     # The loss divides by the degrees of freedom: numbers less those of the state.
-    numbers = np.sum(observed.segments.samples.weight, axis=(1, 2))
+    numbers = np.sum(samples.weight, axis=(1, 2))
     demand(
         bool(np.min(numbers) > (6 if depends_on_attitude else 3)),
         "Argument `observations` must hold more numbers in each trial, and `segment` "
         "in each segment, than a state has, but one does not.",
     )
-    steps = max(1, int(np.ceil(observed.turn / _TURN)))
-    return _Prepared(observed.segments, depends_on_attitude, steps)
+    segments = _Segments(samples, _first_states(readings))
+    steps = max(1, int(np.ceil(longest_turn(readings) / _TURN)))
+    return _Prepared(segments, depends_on_attitude, steps)
+
+
+def _first_states(readings: DirectReadings) -> State:
+    """The observed state at the first sample of each segment."""
+    segment = np.arange(len(readings.ts))
+    # A segment begins at its first sample of any record. Where its first rate comes
+    # later, the Gauss-Newton steps make up for that.
+    first = np.argmax(readings.valid, axis=1)
+    omega = readings.omega[segment, first]
+    if readings.attitude is None:
+        # Nothing depends on the attitude, so that any will do.
+        return State(np.tile(np.eye(1, 4, dtype=omega.dtype), (len(omega), 1)), omega)
+    return State(readings.attitude[segment, first], omega)
 
 
 class _AfterEpoch(NamedTuple):
