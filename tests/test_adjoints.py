@@ -76,3 +76,32 @@ def test_every_adjoint_in_every_mode_under_every_torque(name):
         np.testing.assert_allclose(
             slopes, found["forward"], rtol=0, atol=1e-9, err_msg=way
         )
+
+
+def slowed(parameters, adjoint):
+    """Rate about the third axis under drag, of (start, drag, start time, end time)."""
+    omega, drag, t0, t1 = parameters
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 3.0]), jr.torques.LinearDrag(drag))
+    state0 = jr.State(ATTITUDE, jnp.stack([0.0 * omega, 0.0 * omega, omega]))
+    motion = jr.simulate(body, state0, t1, t0=t0, rtol=1e-11, adjoint=adjoint)
+    return motion.states.omega[2]
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "outer", "inner"),
+    [
+        (DIRECT, jax.jacfwd, jax.jacrev),
+        (DIRECT, jax.jacrev, jax.jacfwd),
+        (FORWARD, jax.jacfwd, jax.jacfwd),
+    ],
+)
+def test_second_derivatives_in_times_and_parameters(adjoint, outer, inner):
+    """All of them, against the closed form omega exp(-drag (t1 - t0) / I3)."""
+
+    def exact(parameters):
+        omega, drag, t0, t1 = parameters
+        return omega * jnp.exp(-drag * (t1 - t0) / 3.0)
+
+    point = jnp.array([2.0, 0.5, 0.2, 3.0])
+    found = quick_jit(outer(inner(lambda x: slowed(x, adjoint))))(point)
+    np.testing.assert_allclose(found, jax.hessian(exact)(point), rtol=1e-7, atol=1e-8)

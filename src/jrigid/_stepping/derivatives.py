@@ -2,19 +2,24 @@
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from jrigid._core.lanes import as_lanes
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.guards import guard_derivative
+from jrigid._stepping.method import method_of
 from jrigid._stepping.motion import Motion, constant, steps_fixed
 from jrigid._stepping.replay import Cotangents, pull_alone, pull_in_lanes
 from jrigid._stepping.run import Ends, record_alone, run_alone, run_in_lanes
+from jrigid._stepping.step import equal_steps
 
 
 def _with_fine_steps(motion: Motion) -> Motion:
@@ -197,30 +202,66 @@ def solve_direct(engine: Engine, motion: Motion) -> Ends:
     return Ends(ys, end.t, y, end.counts)
 
 
+# A step of length zero, whose derivatives are right up to the order of its method.
+_STILL = method_of(diffrax.Tsit5())
+
+# A vector field of (parameters, t, y), of a state that may be several arrays.
+_Field = Callable[[PyTree, Array, PyTree], PyTree]
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def moved_by(
-    field: Callable[[PyTree, Array, Array], Array],
-    parameters: PyTree,
-    t: Array,
-    y: Array,
-    dt: Array,
-) -> Array:
-    """The state a time `dt` later, where `dt` is zero but has derivatives."""
+    field: _Field, parameters: PyTree, t: Array, y: PyTree, dt: Array
+) -> PyTree:
+    """The state a time `dt` later, where `dt` is zero but has derivatives.
+
+    Gradients: of first order in every mode, and of every order forward over forward.
+    Reverse mode keeps of the tangents what was computed, which does not show that a
+    change of the state depends on `dt`. Beyond its first order use `moved_in_a_step`.
+    """
     del field, parameters, t, dt
     return y
 
 
 # With symbolic zeros the field is evaluated only where times have derivatives.
 @partial(moved_by.defjvp, symbolic_zeros=True)
-def _moved_by_jvp(field: Callable, primals: tuple, tangents: tuple) -> tuple:
+def _moved_by_jvp(field: _Field, primals: tuple, tangents: tuple) -> tuple:
     parameters, t, y, dt = primals
-    # In a time of zero neither the parameters nor the time have an effect.
-    _, _, y_dot, dt_dot = tangents
+    *changes, dt_dot = tangents
     value = moved_by(field, parameters, t, y, dt)
-    total = jnp.zeros_like(y)
-    if not isinstance(y_dot, jax.custom_derivatives.SymbolicZero):
-        total = total + y_dot
+    changes = jtu.tree_map(_instantiated, changes)
+    parameters_dot, t_dot, y_dot = changes
+
+    def of_both(parameters: PyTree, t: Array, both: PyTree) -> PyTree:
+        """The vector field of a state and of its change."""
+        parameters, *dots = parameters
+        y, y_dot = both
+        return jax.jvp(field, (parameters, t, y), (*dots, y_dot))
+
+    # A change of the state moves in `dt`, too.
+    parameters = (parameters, parameters_dot, t_dot)
+    _, total = moved_by(of_both, parameters, t, (y, y_dot), dt)
     if not isinstance(dt_dot, jax.custom_derivatives.SymbolicZero):
-        # `t + dt` and `value` depend on `dt`, so that higher derivatives are right too.
-        total = total + field(parameters, t + dt, value) * dt_dot
+        rates = field(parameters[0], t + dt, value)
+        total = jtu.tree_map(lambda x, rate: x + rate * dt_dot, total, rates)
     return value, total
+
+
+def _instantiated(tangent: PyTree) -> PyTree:
+    """A tangent as an array, where it is a symbolic zero."""
+    if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
+        return tangent
+    aval: Any = tangent.aval
+    # The tangents of integers are numpy arrays of no size.
+    if aval.dtype == jax.dtypes.float0:
+        return np.zeros(aval.shape, aval.dtype)
+    return jnp.zeros(aval.shape, aval.dtype)
+
+
+def moved_in_a_step(
+    field: _Field, parameters: PyTree, t: Array, y: Array, dt: Array
+) -> Array:
+    """`moved_by` with derivatives in every mode, up to the order of a step's method."""
+    moved = equal_steps(_STILL, partial(field, parameters), t, dt, y)
+    # The rates of a state need not be finite, and only derivatives need them.
+    return jnp.where(jnp.isfinite(moved), moved, y)

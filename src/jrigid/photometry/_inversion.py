@@ -52,6 +52,8 @@ _IS_THIN = (
 )
 # How many of the solutions that do not count as aliases are kept.
 _REJECTED = 5
+# An error of an angle [rad] beyond which the angle is not known at all.
+_ANY_ANGLE = np.pi
 # Digits of a period in hours whose error is not known.
 _USUAL_DIGITS = 4
 
@@ -436,5 +438,7 @@ def in_hours(period: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
 
 
 def in_degrees(angle: Float[AnyArray, ""], error: Float[AnyArray, ""]) -> str:
-    """An angle in degrees with its error."""
+    """An angle in degrees with its error, unless it may be any angle."""
+    if error > _ANY_ANGLE:
+        return "undetermined"
     return f"{np.rad2deg(angle):.1f} +- {np.rad2deg(error):.1f} degrees"

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,17 +13,14 @@ from jrigid._checks import RESULTS, AnyBool, Findings, array_of_shape, harmless
 from jrigid._core.third_party import ClosedJaxpr, jaxpr_as_fun
 from jrigid._motion import check_motion, depends_on, harmless_motion, resolves
 from jrigid._stepping.control import Limits, largest_steps
-from jrigid._stepping.method import method_of
+from jrigid._stepping.derivatives import moved_in_a_step
 from jrigid._stepping.motion import Motion, constant
 from jrigid._stepping.scales import units
-from jrigid._stepping.step import equal_steps
 from jrigid._types import BodyState
 from jrigid.simulate._options import SMALLEST_RTOL, Inputs, Options
 from jrigid.solvers import Splitting
 from jrigid.systems import AbstractSystem
 
-# The method of a step of length zero, whose derivatives are right up to its order.
-_STEP = method_of(diffrax.Tsit5())
 # One step may commit this fraction of rtol. The fraction is smaller for methods of an
 # order below 8, whose error estimates are as large as their errors.
 _FRACTION = 0.5
@@ -129,14 +125,12 @@ def with_derivatives_of_start(inputs: Inputs) -> Inputs:
     held = jax.lax.stop_gradient(inputs.t0)
     start, to_state = ravel_pytree(inputs.state0)
 
-    def rates(t: Array, y: Array) -> Array:
+    def rates(inputs: Inputs, t: Array, y: Array) -> Array:
         return _rates(inputs, t, to_state(y))
 
     length = (held - inputs.t0).astype(start.dtype)
-    moved = equal_steps(_STEP, rates, inputs.t0.astype(start.dtype), length, start)
-    # A check must report the state that was passed, and not one that is NaN because of
-    # the torque.
-    moved = jnp.where(jnp.isfinite(moved), moved, start)
+    t = inputs.t0.astype(start.dtype)
+    moved = moved_in_a_step(rates, inputs, t, start, length)
     return inputs._replace(state0=to_state(moved), t0=held)
 
 
