@@ -403,6 +403,23 @@ def test_attitudes_that_leap_are_left_out_wherever_they_are(rng, turned):
     covers(found, 3 * np.diag(moments) / np.sum(moments))
 
 
+@pytest.mark.parametrize(("share", "size"), [(0.05, 300.0), (0.05, 1e6), (0.2, 1.0)])
+def test_robust_fits_find_their_way_past_any_outliers(rng, share, size):
+    """They are judged by what is left: its size is that of the noise."""
+    for _ in range(4):
+        tensor = body_of(rng)
+        _, values = seen(rng, tensor, sigma=0.02)
+        values = np.array(values)
+        off = rng.random(len(values)) < share
+        values[off] += size * rng.normal(size=(np.sum(off), 3))
+        found = fitted(values, 0.02, loss="robust")
+        assert is_in(found, (Status.OK,)), words(found)
+        assert float(found.diagnostics.scales[0]) == pytest.approx(1.0, abs=0.2)
+        # A few outliers are small, and a few good samples are far off.
+        assert np.mean(np.asarray(found.kept[0]) == off) < 0.05
+        covers(found, tensor)
+
+
 @pytest.mark.slow  # a program of its own
 def test_robust_does_not_trial_all_away_where_the_model_is_wrong(rng):
     """A torque moves the rates by 65 times the noise."""

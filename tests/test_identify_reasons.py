@@ -290,10 +290,16 @@ def test_a_noise_stated_a_little_too_small_is_no_scatter_between_trials(readings
     """6 % show in 12000 residuals, of which chi-square scatters by 1.3 %."""
     found, _ = first_line(readings, NOISE)
     fields = lambda x: (x.status, x.chi_square, x.degrees_of_freedom)  # noqa: E731
-    for square, text in ((1.06**2, "`sigma` is too small"), (1.0, "Trials differ")):
+
+    def line(result, square):
         other = (Status.MISFIT, jnp.asarray(12000 * square), jnp.asarray(12000))
-        line = reason(eqx.tree_at(fields, found, other))
-        assert text in line
+        return reason(eqx.tree_at(fields, result, other))
+
+    assert "`sigma` is too small" in line(found, 1.06**2)
+    # A single trial does not differ from others.
+    assert line(found, 1.0) == ""
+    several = eqx.tree_at(lambda x: x.kept, found, jnp.repeat(found.kept, 2, axis=0))
+    assert "Trials differ" in line(several, 1.0)
 
 
 # Conventions of other programs
@@ -478,3 +484,35 @@ def test_turns_of_attitudes_and_rates_are_compared_at_any_times(turning, untyped
     assert not agree(scalar_last(q), shown)
     assert not agree(q, DEGREES * shown)
     assert conventions.turns_agree((identify.Attitudes(ts, q, 0.01),)) is None
+
+
+@pytest.mark.parametrize("limit", [4.0, np.array([3.0, 2.5, 5.0])])
+def test_a_limit_of_the_gyro_that_is_not_passed_is_named(readings, limit):
+    clipped = np.clip(readings, -limit, limit)
+    found, line = first_line(clipped, NOISE)
+    assert found.status not in (Status.OK, Status.UNIDENTIFIABLE)
+    assert re.search(r"stand at its largest value, (4|3|2\.5|5) rad/s", line)
+    record = identify.Record(identify.Gyro(limit=limit), TS, clipped, NOISE)
+    passed = identify.fit(BLIND, record, throw=False)
+    assert "largest value" not in str(passed)
+
+
+def test_readings_in_coarse_steps_are_not_those_at_a_limit(readings):
+    """The most frequent reading of a peak is a level beside others."""
+    found, line = first_line(np.round(readings, 0), NOISE)
+    assert found.status == Status.MISFIT
+    assert "largest value" not in line
+
+
+def test_a_spin_whose_torque_is_sought_is_named_where_it_fails(rng):
+    """Records that the search cannot follow, since their bodies are any."""
+    lines = []
+    for _ in range(4):
+        rates = np.array([0.0, 0.0, 2.0]) + NOISE * rng.normal(size=(102, 3))
+        record = identify.Rates(np.linspace(0, 6, 102), rates, NOISE)
+        found = identify.fit(BLIND, record, unmodelled="estimate", throw=False)
+        if found.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
+            lines.append(str(found).splitlines()[0])
+        else:
+            assert found.status == Status.UNIDENTIFIABLE
+    assert all("say nothing of the inertia" in line for line in lines)

@@ -528,6 +528,21 @@ def table(names, columns, separator=","):
     )
 
 
+def test_the_unit_of_times_is_recognised_where_they_decrease():
+    ts = 0.05 * np.arange(50)
+    rows = np.column_stack([ts, np.cos(ts), np.sin(ts), ts])[::-1]
+    reading = read(table(["t", "wx (rad/s)", "wy (rad/s)", "wz (rad/s)"], rows))
+    said(reading, "taken as s: their median step is 0.05")
+    said(reading, "newest first")
+    np.testing.assert_allclose(reading.times, ts, atol=1e-12)
+
+
+def test_columns_of_one_name_are_noted():
+    rows = np.column_stack([0.01 * np.arange(50), np.ones((50, 4))])
+    names = ["t (s)", "wx (rad/s)", "wx (rad/s)", "wy (rad/s)", "wz (rad/s)"]
+    said(read(table(names, rows)), "2 columns are called 'wx (rad/s)'")
+
+
 @pytest.mark.parametrize(
     "names",
     [

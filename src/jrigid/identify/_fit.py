@@ -673,24 +673,22 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
         problem, follows = _along_the_torque(problem, opening)
         if follows:
             break
-    tensor = opening.tensor
-    if options.dense:
-        # A level is sought, in proportion to the tensor.
-        numbers = np.stack([opening.starts[0]] * 2)
-        tensor = np.asarray(tensors_at(problem.unknowns, numbers))[0]
     case = Case(
         problem=problem,
         single=opening.single,
         cut=opening.cut,
         point=opening.point,
         starts=opening.starts,
-        tensor=tensor,
+        tensor=_first_tensor(problem, opening),
         torque=task.torque,
         coarse=observed.coarse,
         long=observed.angle > _LONG,
         alias=None,
+        given=None,
         effort=effort,
     )
+    if task.tensor is not None and state is not None:
+        case = _with_given(case, state)
     if usable and observed.alias is not None:
         other = observed._replace(readings=observed.alias)
         opening = _opening(given, other, opening.tensor, state, options, length)
@@ -706,6 +704,31 @@ def _problem(options: Options, observed: _Observed, opening: _Opening) -> Proble
     line = Line(np.zeros_like(numbers), np.zeros((), numbers.dtype))
     unknowns = opening.unknowns.holding(line)
     return Problem(options, unknowns, observed.samples, observed.noise)
+
+
+def _first_tensor(problem: Problem, opening: _Opening) -> np.ndarray:
+    """The tensor in proportion to which the level of a torque is sought."""
+    if not problem.options.dense:
+        return opening.tensor
+    numbers = np.stack([opening.starts[0]] * 2)
+    return np.asarray(tensors_at(problem.unknowns, numbers))[0]
+
+
+def _with_given(case: Case, state: State) -> Case:
+    """The case of a record, which may also begin at a state that the user gave.
+
+    Only the exact flow goes on from there in one segment a trial.
+    """
+    options = case.problem.options
+    if options.dense or not options.free_motion:
+        return case
+    point = case.point
+    dtype = point.omega.dtype
+    omega = np.broadcast_to(state.omega[:, None], point.omega.shape)
+    attitude = np.broadcast_to(state.attitude[:, None], point.attitude.shape)
+    point = point._replace(omega=omega.astype(dtype), attitude=attitude.astype(dtype))
+    given = dataclasses.replace(case, cut=case.single, point=point)
+    return dataclasses.replace(case, given=given)
 
 
 def _read_anew(case: Case, problem: Problem, opening: _Opening) -> Case:

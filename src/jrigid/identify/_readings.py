@@ -12,9 +12,10 @@ from jrigid.identify._host import conjugate, exp, log, multiply, normalize
 from jrigid.identify._records import Record, Samples, first_and_last, tells
 from jrigid.identify._sensors import AbstractSensor
 
-# An attitude so many times as far from the path of its neighbours as others are from
+# A reading so many times as far from the path of its neighbours as others are from
 # that of theirs is no place to begin a segment.
 _LONE = 8.0
+_AROUND = 3  # samples to each side whose median is the path of rates
 # Intervals that differ by more than this part are no equal ones.
 _UNEVEN = 0.1
 # Radians from one attitude to the next, twelve samples a turn.
@@ -281,6 +282,21 @@ def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray
     return result
 
 
+def _leaping(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Which rates of a trial leap from the medians of those around them."""
+    del ts
+    place = np.flatnonzero(valid)
+    result = np.zeros_like(valid)
+    if place.size < 2 * _AROUND + 1:
+        return result
+    known = rates[place]
+    around = np.pad(known, ((_AROUND, _AROUND), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * _AROUND + 1, axis=0)
+    off = np.max(np.abs(known - np.median(windows, axis=-1)), axis=1)
+    result[place] = off > _LONE * np.median(off)
+    return result
+
+
 def direct_readings_of(
     records: tuple[Record, ...],
     samples: Samples,
@@ -294,13 +310,16 @@ def direct_readings_of(
         samples: Samples of the records.
         attitude0: Attitude at the first sample of each trial, for dead reckoning where
             none was observed.
-        robust: Whether attitudes that leap for a single sample are passed over.
+        robust: Whether readings that leap away from those around them are passed over.
     """
     rates = _first_series(records, samples, "rates")
     attitudes = _first_series(records, samples, "attitude")
     if attitudes is not None and robust:
         lone = _for_each_trial(_lone, *attitudes)
         attitudes = attitudes._replace(valid=attitudes.valid & ~lone)
+    if rates is not None and robust:
+        leaping = _for_each_trial(_leaping, *rates)
+        rates = rates._replace(valid=rates.valid & ~leaping)
     if rates is None:
         if attitudes is None:
             return None

@@ -28,6 +28,10 @@ _LIKE = 16.0
 _WHITE = 0.1  # correlation of neighbours
 _WHITE_SURE = 5.0  # standard deviations of that
 _FEWEST = 16  # samples whose spectrum says something
+# Readings at the largest value of an axis that show a limit: so many, and so many times
+# as many as at the next value, since coarse readings repeat theirs.
+_AT_LIMIT = 8
+_MORE_THAN_NEXT = 5
 
 
 def reason(result: FitResult) -> str:
@@ -66,6 +70,12 @@ def _reason(result: FitResult) -> str:
             "The body does not turn: the readings are no larger than their noise. "
             "Inertia shows in rates that change."
         )
+    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
+    if failed and _is_steady(result):
+        return (
+            "The rates do not change by more than their noise: those of a spin about "
+            "one axis, or of a sphere, say nothing of the inertia."
+        )
     swing = 0.0 if result.status == Status.OK else _swing(result)
     if swing > _TOO_FAST:
         return (
@@ -90,7 +100,7 @@ def _reason(result: FitResult) -> str:
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
-    return _of_gyro(result) or _of_noise(result)
+    return _of_limit(result) or _of_gyro(result) or _of_noise(result)
 
 
 def _may_turn_the_other_way(result: FitResult) -> bool:
@@ -123,6 +133,32 @@ def _of_gyro(result: FitResult) -> str:
     if len(sentences) > 1:
         sentences.append("The record hardly tells which of them it is.")
     return " ".join(sentences)
+
+
+def _of_limit(result: FitResult) -> str:
+    """The limit at which readings of a gyro stand, or an empty text without one."""
+    for sensor, values, part in zip(
+        result.fitted()[1:],
+        result.problem.samples.values,
+        result.problem.samples.parts,
+        strict=True,
+    ):
+        if not isinstance(sensor, Gyro) or sensor.saturation() is not None:
+            continue
+        is_seen = np.asarray(result.problem.samples.seen)[:, part]
+        for sizes in np.abs(np.asarray(values)[is_seen]).T:
+            # An axis that reads nothing says nothing.
+            levels, counts = np.unique(np.append(sizes, 0.0), return_counts=True)
+            at_next, at_last = np.append(0, counts)[-2:]
+            is_zero = levels[-1] == 0
+            few = at_last < max(_AT_LIMIT, _MORE_THAN_NEXT * at_next)
+            if not (is_zero or few):
+                return (
+                    f"{at_last} readings of an axis stand at its largest value, "
+                    f"{levels[-1]:.6g} rad/s: the gyro saturates there. Pass it "
+                    "(`Gyro(limit=...)`)."
+                )
+    return ""
 
 
 def _of_gyro_error(name: str, value: np.ndarray) -> str:
@@ -176,13 +212,28 @@ def _is_at_rest(result: FitResult) -> bool:
     """Whether the noise and the bias of the gyro explain its readings."""
     if not (_by_gyro(result) and result.problem.options.noise_known):
         return False
+    return _is_noise(result, np.asarray(result.fitted()[1].bias))
+
+
+def _is_steady(result: FitResult) -> bool:
+    """Whether the readings of a gyro are constant in each trial but for their noise."""
+    if not (_by_gyro(result) and result.problem.options.noise_known):
+        return False
+    part = result.problem.samples.parts[0]
+    is_seen = np.asarray(result.problem.samples.seen)[:, part, None]
+    rates = np.where(is_seen, np.asarray(result.problem.samples.values[0]), 0.0)
+    count = np.maximum(np.sum(is_seen, axis=1, keepdims=True), 1)
+    return _is_noise(result, np.sum(rates, axis=1, keepdims=True) / count)
+
+
+def _is_noise(result: FitResult, rates: np.ndarray) -> bool:
+    """Whether the readings of a gyro differ from some rates by their noise alone."""
     samples = result.problem.samples
     part = samples.parts[0]
     is_seen = np.asarray(samples.seen)[:, part]
     whitener = np.asarray(samples.whitener)[:, part, :, :3][is_seen]
-    bias = np.asarray(result.fitted()[1].bias)
-    rates = np.asarray(samples.values[0])[is_seen] - bias
-    errors = np.einsum("nij,nj->ni", whitener, rates)
+    errors = (np.asarray(samples.values[0]) - rates)[is_seen]
+    errors = np.einsum("nij,nj->ni", whitener, errors)
     # The mean square of white errors scatters by sqrt(2 / n).
     return bool(np.mean(errors**2) < 1 + GATE * math.sqrt(2 / errors.size))
 
@@ -262,6 +313,8 @@ def _of_noise(result: FitResult) -> str:
             "and `free`."
         )
     if square <= 1 + chance:
+        if len(result.kept) == 1:
+            return ""
         return (
             "Trials differ by more than their errors say: they may be of different "
             "bodies."

@@ -58,6 +58,7 @@ _WEIGHTS = {True: (1.0, 30.0, 1e3), False: (1.0, 10.0, 100.0, 1e3, 1e4)}
 _SLOW = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4)
 _LARGEST = {8: 1e4, 4: 100.0}  # whose square is still far from the digits' end
 _IN_A_STAGE = 15
+_REJECTIONS = 3  # stages after each of which outliers are judged anew
 _APART = 3  # stages in which the parts of a coarse record are not linked
 _GAP = 3.5  # radians between nodes: a segment without samples, longer than others are
 # The most records of one compiled call on a GPU. On a CPU each call takes one, as `fit`
@@ -198,6 +199,8 @@ class Case:
         coarse: Whether the body turns by more than half a turn between samples.
         long: Whether it turns many times, so that probes must go slowly too.
         alias: The same record as that of another motion, if there may be one.
+        given: The same record, from the body and the states that the user gave, if
+            that is where a search may begin.
         effort: How hard to try.
     """
 
@@ -211,6 +214,7 @@ class Case:
     coarse: bool
     long: bool
     alias: "Case | None"
+    given: "Case | None"
     effort: Effort
 
     @property
@@ -256,7 +260,8 @@ def stages_of(case: Case, slow: bool) -> list[Stage]:
             stages = [*(x._replace(apart=True) for x in stages[:_APART]), *stages]
     stages = [x._replace(soft=options.robust) for x in (*stages, end)]
     if options.robust:
-        stages.append(end._replace(soft=False, reject=True))
+        # What is left out changes the fit, and with it what is far off.
+        stages += _REJECTIONS * [end._replace(soft=False, reject=True)]
     return stages
 
 
@@ -284,27 +289,32 @@ def attempt(
     options = problem.options
     dtype = case.point.omega.dtype
     kept = problem.samples.seen.astype(dtype)
+    candidates = kept
     scales = np.ones(len(problem.samples.values), dtype)
     torque = _Torque(case, problem)
     point = case.point._replace(numbers=numbers)
     histories = []
-    minimum = None
+    fit = None
+    has_left_out = False
     for stage in stages_of(case, slow):
         if torque.at_rest and not stage.last:
             continue
-        if options.robust and minimum is not None:
-            # Rows of prior knowledge follow those of the samples.
-            residual = minimum.rows.residual[:, : kept.shape[1]]
-            scales = scales_of(problem, residual, kept)
-            if stage.reject:
-                kept = without_outliers(problem, residual, kept, scales)
+        if options.robust and fit is not None:
+            scales = scales_of(problem, fit.residual, kept)
+        if stage.reject:
+            assert fit is not None  # other stages come first
+            chosen = without_outliers(problem, fit.residual, candidates, scales)
+            if has_left_out and np.array_equal(chosen, kept):
+                break
+            kept = chosen
+            has_left_out = True
+        else:
+            candidates = kept
         if framed:
             problem, point = _in_own_frame(problem, point)
         torque.begin(stage)
+        layout = _layout_of(case, stage, point)
         settings = _settings(stage, kept, scales, torque.disturbance)
-        layout = case.single if stage.whole else case.cut
-        if stage.apart:
-            layout = _without_gaps(layout, point)
         minimum, history = yield from _stage(Request(problem, layout, point, settings))
         point = minimum.point
         histories.append(history)
@@ -322,11 +332,21 @@ def attempt(
             case.effort.report(_progress(stage, fit))
         if options.unmodelled == "estimate" and not stage.last:
             kept = torque.sought_anew(fit)
-    return fit
+    assert fit is not None  # there is always a last stage
+    if options.robust:
+        # It is judged by its own residuals, and not by those of the stage before.
+        scales = scales_of(problem, fit.residual, kept)
+    return dataclasses.replace(fit, scales=scales, computed={})
 
 
-def _without_gaps(layout: Layout, point: Point) -> Layout:
-    """The layout without links between nodes that are many radians apart."""
+def _layout_of(case: Case, stage: Stage, point: Point) -> Layout:
+    """The layout of a stage.
+
+    Parts that are apart have no links between nodes that are many radians apart.
+    """
+    layout = case.single if stage.whole else case.cut
+    if not stage.apart:
+        return layout
     turned = np.linalg.norm(point.omega, axis=-1) * (layout.end - layout.start)
     return layout._replace(linked=layout.linked & (turned < _GAP))
 
@@ -457,6 +477,34 @@ def search(case: Case) -> Search:
     is fitted anew. How little chi-square grows tells the error. Of coarse records,
     which have aliases, several attempts are compared.
     """
+    best, ambiguous = yield from _best_of_attempts(case)
+    if case.given is not None and misfit(best) > 0:
+        given = case.given
+        other = yield from attempt(given, given.problem, given.starts[0], slow=False)
+        best = other if misfit(other) < misfit(best) else best
+    if case.alias is not None and (misfit(best) > 0 or not ambiguous):
+        read = best
+        best, rival = yield from _beside_alias(case.alias, best)
+        if best is not read:
+            # Probes begin where this fit began.
+            case = case.alias
+        ambiguous = ambiguous or rival
+    best = yield from _off_zero(case, best)
+    best = dataclasses.replace(best, ambiguous=ambiguous)
+    if misfit(best) == 0 and not ambiguous and not case.problem.options.dense:
+        # Squares beside levels of their own differ, so fits with a level are not
+        # probed.
+        best = yield from _probed(case, best, weakest(best))
+    if _is_thickness_unknown(best):
+        thicker = yield from _thicker(case, best)
+        best = dataclasses.replace(best, thicker=thicker)
+    return best
+
+
+def _best_of_attempts(
+    case: Case,
+) -> Generator[Request, Minimum, tuple[Fit, bool]]:
+    """The best of all attempts, and whether others far from it are about as good."""
     problem = case.problem
     # Few samples of a coarse record follow any alias.
     counted = np.sum(weights_of(problem, problem.samples.seen.astype(float)))
@@ -482,26 +530,7 @@ def search(case: Case) -> Search:
             wrong = other_wrong
             weak = other_weak
         index += 1
-    if case.alias is not None and (wrong > 0 or not ambiguous):
-        read = best
-        best, rival = yield from _beside_alias(case.alias, best)
-        if best is not read:
-            # Probes begin where this fit began.
-            case = case.alias
-        ambiguous = ambiguous or rival
-        wrong = misfit(best)
-        weak = weakest(best)
-    best = yield from _off_zero(case, best)
-    weak = weakest(best)
-    best = dataclasses.replace(best, ambiguous=ambiguous)
-    if wrong == 0 and not ambiguous and not problem.options.dense:
-        # Squares beside levels of their own differ, so fits with a level are not
-        # probed.
-        best = yield from _probed(case, best, weak)
-    if _is_thickness_unknown(best):
-        thicker = yield from _thicker(case, best)
-        best = dataclasses.replace(best, thicker=thicker)
-    return best
+    return best, ambiguous
 
 
 def _off_zero(case: Case, best: Fit) -> Search:

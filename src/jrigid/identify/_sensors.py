@@ -411,6 +411,12 @@ class MomentumSensor(AbstractSensor):
         """Raise ValueError for another frame."""
         check_option("frame", self.frame, ("space", "body"))
 
+    # A class variable in other sensors.
+    @property
+    def depends_on_attitude(self) -> bool:  # pyright: ignore
+        """Whether the values are those in space axes."""
+        return self.frame == "space"
+
     def predict(self, t: ScalarLike, state: State, system: AbstractSystem) -> Array:
         """Predict the angular momentum."""
         if self.frame == "space":

@@ -278,6 +278,8 @@ def _chosen(
     apart = columns.keys() - _UNITS.keys() - set(main.table.headers)
     message = f"must name columns of one file, but {apart} is apart."
     demand(not apart, f"Argument `columns` {message}")
+    for sensor in chosen.values():
+        notes += _read_once(sensor)
     for kind, sensor in sensors:
         read = chosen.get(kind, sensor)
         if read.table is not sensor.table:
@@ -287,6 +289,17 @@ def _chosen(
                 f"{read.table.name!r} are read"
             )
     return chosen, main
+
+
+def _read_once(sensor: _Sensor) -> list[str]:
+    """Notes on columns of a sensor whose header is that of others, too."""
+    headers = sensor.table.headers
+    names = [headers[j] for j in sensor.columns]
+    return [
+        f"{headers.count(name)} columns are called {name!r}: the first is read"
+        for name in names
+        if headers.count(name) > 1
+    ]
 
 
 def _in_si(
@@ -499,17 +512,19 @@ def _recognised(kind: str, values: np.ndarray, turned: str) -> tuple[str | None,
     """The unit in which alone numbers make sense, and why."""
     if kind == "rates":
         return _recognised_rates(values, turned)
-    size = np.diff(values) if kind == "times" else np.linalg.norm(values, axis=1)
+    # Rows may have the newest first.
+    is_time = kind == "times"
+    size = np.abs(np.diff(values)) if is_time else np.linalg.norm(values, axis=1)
     size = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
     usual = _USUAL.get(kind, {}).items()
     unit = next((unit for unit, (least, most) in usual if least <= size < most), None)
-    if unit is None and kind == "times":
+    if unit is None and is_time:
         raise ValueError(
             "Argument `unit` must say the unit of the times, but it does not, and "
             f"steps of {size:g} are neither s, ms, us nor ns at 8 Hz to 8 kHz. "
             f"(`unit={{'times': ...}}`, one of {', '.join(_UNITS[kind])}.)"
         )
-    return unit, f"their median {'step ' * (kind == 'times')}is {size:.4g}"
+    return unit, f"their median {'step ' * is_time}is {size:.4g}"
 
 
 def _recognised_rates(values: np.ndarray, turned: str) -> tuple[str, str]:
