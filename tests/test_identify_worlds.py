@@ -210,6 +210,47 @@ def test_gyrostat_takes_many_trials_and_states_its_errors(rng):
         identify.gyrostat(ts[:, ::-1], values, momenta)
 
 
+def test_momenta_in_body_axes_beside_a_gyro_need_no_attitude(rng):
+    motion = jr.free_rotation(TENSOR, jr.State(np.array([1.0, 0, 0, 0]), OMEGA), TS)
+    omegas = np.asarray(motion.omega)
+    momenta = omegas @ TENSOR + 1e-3 * rng.normal(size=omegas.shape)
+    records = (
+        identify.Rates(TS, omegas + 1e-3 * rng.normal(size=omegas.shape), 1e-3),
+        identify.AngularMomenta(TS, momenta, 1e-3, frame="body"),
+    )
+    found = identify.fit(BLIND, records, scale="known")
+    assert found.status == Status.OK
+    off = np.asarray(found.inertia - TENSOR)[np.triu_indices(3)]
+    assert np.all(np.abs(off) < 5 * np.sqrt(np.diagonal(upper(found))))
+
+
+def upper(found):
+    """Covariance of the upper triangle of the tensor."""
+    places = np.ravel_multi_index(np.triu_indices(3), (3, 3))
+    covariance = np.asarray(found.inertia_covariance).reshape(9, 9)
+    return covariance[np.ix_(places, places)]
+
+
+def test_a_fit_does_not_end_worse_than_it_was_told_to_begin(rng):
+    """One axis is always at the limit of the gyro, so that the rates mislead."""
+    tensor = np.array(
+        [
+            [0.9809, -0.0507, -0.2102],
+            [-0.0507, 0.9252, 0.1061],
+            [-0.2102, 0.1061, 1.0939],
+        ]
+    )
+    state = jr.State(np.array([1.0, 0, 0, 0]), np.array([-1.39686, 0.8451, 2.51686]))
+    ts = np.linspace(0.0, 12.0, 240)
+    omegas = np.asarray(jr.free_rotation(tensor, state, ts).omega)
+    for _ in range(4):
+        values = np.clip(omegas + 0.02 * rng.normal(size=omegas.shape), -1.5, 1.5)
+        record = identify.Record(identify.Gyro(limit=1.5), ts, values, 0.02)
+        first = identify.residuals(jr.RigidBody(tensor), state, record)
+        found = identify.fit(BLIND, record, start=(tensor, state))
+        assert float(found.chi_square) < float(jnp.sum(first**2))
+
+
 # The posterior
 
 

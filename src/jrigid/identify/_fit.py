@@ -225,7 +225,8 @@ def fit_each(
         free: As for `fit`.
         scale: As for `fit`.
         inertia_model: As for `fit`.
-        start: What `fit` takes, once for each fit.
+        start: What `fit` takes, once for each fit. States of internal parts must be the
+            same in all.
         unmodelled: As for `fit`.
         loss: As for `fit`.
         absolute_sigma: As for `fit`.
