@@ -133,14 +133,17 @@ class Walk(NamedTuple):
 
     def _together(self, t: Array, y: Array) -> Array:
         """Time derivatives of the state and of its tangents."""
-        state, tangents, alone = self.state(y), self.tangents(y), y[: self.scales.size]
+        state = self.state(y)
+        tangents = self.tangents(y)
+        alone = y[: self.scales.size]
         if not tangents.size:
             return self.rates(t, y)
 
         units = self.scales[4:]  # powers of two
 
         def beside(tangent: Array) -> tuple[Array, Array]:
-            turn, change = tangent[:3], units * tangent[3:]
+            turn = tangent[:3]
+            change = units * tangent[3:]
             moved = jnp.concatenate([attitude_rate(state.attitude, turn), change])
             rates, growth = jax.jvp(lambda y: self.rates(t, y), (alone,), (moved,))
             # x' = y - omega x x of docs/stability.md. A turn has three components,
@@ -159,7 +162,8 @@ class Walk(NamedTuple):
         Such a solver is no explicit Runge-Kutta method.
         """
         term = diffrax.ODETerm(lambda t, y, _: self._together(t, y))  # pyright: ignore
-        solver, end = self.motion.solver, t + self.step
+        solver = self.motion.solver
+        end = t + self.step
         memory = solver.init(term, t, end, y, None)
         return solver.step(term, t, end, y, None, memory, made_jump=False)[:3]
 
