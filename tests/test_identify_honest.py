@@ -403,6 +403,26 @@ def test_attitudes_that_leap_are_left_out_wherever_they_are(rng, turned):
     covers(found, 3 * np.diag(moments) / np.sum(moments))
 
 
+def test_many_attitudes_of_swapped_markers_are_left_out(rng):
+    """15 % of them, half a turn off, and often several in a row."""
+    ts = np.linspace(0.0, 20.0, 200)
+    for _ in range(4):
+        tensor = body_of(rng)
+        start = jr.State(np.array([1.0, 0, 0, 0]), spin_of(rng, tensor, 2.0))
+        attitudes = np.array(jr.free_rotation(tensor, start, ts).states.attitude)
+        turns = 0.01 * rng.normal(size=(200, 3))
+        swapped = rng.choice(200, 30, replace=False)
+        turns[swapped] = [0.0, 0.0, np.pi]
+        values = jax.vmap(jr.rotation.multiply)(
+            attitudes, jax.vmap(jr.rotation.exp)(turns)
+        )
+        record = identify.Attitudes(ts, values, 0.01)
+        found = identify.fit(BLIND, record, loss="robust")
+        assert is_in(found, (Status.OK,)), words(found)
+        assert not np.any(np.asarray(found.kept)[0, swapped])
+        covers(found, tensor)
+
+
 @pytest.mark.parametrize(("share", "size"), [(0.05, 300.0), (0.05, 1e6), (0.2, 1.0)])
 def test_robust_fits_find_their_way_past_any_outliers(rng, share, size):
     """They are judged by what is left: its size is that of the noise."""

@@ -516,3 +516,23 @@ def test_a_spin_whose_torque_is_sought_is_named_where_it_fails(rng):
         else:
             assert found.status == Status.UNIDENTIFIABLE
     assert all("say nothing of the inertia" in line for line in lines)
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.15])
+def test_readings_near_a_limit_that_is_passed_show_no_bias_but_a_true_one(rng, bias):
+    """Those with the larger noise are saturated, so that the others have a mean."""
+    ts = np.linspace(0.0, 20.0, 200)
+    start = jr.State(np.array([1.0, 0, 0, 0]), np.array([-1.04, 0.7, -1.56]))
+    moments = np.array([1.0, 1.6, 2.2])
+    omegas = np.asarray(jr.free_rotation(moments, start, ts).omega)
+    statuses = set()
+    for _ in range(6):
+        noisy = omegas + 0.02 * rng.normal(size=omegas.shape)
+        noisy[:, 2] += bias
+        values = np.clip(noisy, -1.6, 1.6)
+        record = identify.Record(identify.Gyro(limit=1.6), ts, values, 0.02)
+        found = identify.fit(BLIND, record, throw=False)
+        statuses.add(int(found.status))
+        if bias:
+            assert "A bias of the gyro" in str(found).splitlines()[0]
+    assert statuses == {int(Status.MISFIT if bias else Status.OK)}

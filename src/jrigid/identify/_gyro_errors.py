@@ -34,6 +34,8 @@ _EXPLAINED = 0.5
 # Part of the square of the rates' changes that free rotation must explain. Where a
 # torque moves the body as much, the derivatives below are not those of the motion.
 _FREE = 0.8
+# Standard deviations from a limit at which no reading is saturated.
+_CLEAR = 4.0
 # Part of the square of an effect that nothing else may imitate, to be shown.
 _UNSHOWN = 1e-10
 
@@ -109,7 +111,7 @@ def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
     gyros = [i for i, sensor in enumerate(sensors) if isinstance(sensor, Gyro)]
     if not (gyros and np.isfinite(fit.minimum.square)):
         return GyroErrors()
-    effects = _effects(fit, gyros[0], sensors[gyros[0]])
+    effects = _effects(fit, gyros[0], sensors[gyros[0]], noise)
     if not effects:
         return GyroErrors()
     table = _table(fit, effects)
@@ -119,7 +121,7 @@ def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
     return _sought(fit, table, noise, float(np.max(np.abs(readings))))
 
 
-def _effects(fit: Fit, index: int, gyro: Gyro) -> dict[str, np.ndarray]:
+def _effects(fit: Fit, index: int, gyro: Gyro, noise: float) -> dict[str, np.ndarray]:
     """Whitened effects of errors of a gyroscope on all rows.
 
     An error may be several numbers (trials, rows, degrees, numbers).
@@ -131,7 +133,15 @@ def _effects(fit: Fit, index: int, gyro: Gyro) -> dict[str, np.ndarray]:
     used = np.all(weight > 0, axis=-1)
     safe = np.where(used[..., None, None], whitener, np.eye(3))
     errors = np.linalg.solve(safe, fit.residual[:, part, :3, None])[..., 0]
-    offset = np.asarray(samples.values[index]) + errors - np.asarray(gyro.bias)
+    predicted = np.asarray(samples.values[index]) + errors
+    limit = gyro.saturation()
+    if limit is not None:
+        # Of readings near the limit those with the larger noise are saturated. The mean
+        # of the others is biased.
+        spread = np.sqrt(noise) * np.linalg.norm(np.linalg.inv(safe), axis=-1)
+        is_clear = np.abs(predicted) < np.asarray(limit) - _CLEAR * spread
+        used = used & np.all(is_clear, axis=-1)
+    offset = predicted - np.asarray(gyro.bias)
     shape = fit.minimum.rows.residual.shape
     effects = {}
     changes = _changes(fit, index, gyro, offset, used)

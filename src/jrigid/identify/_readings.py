@@ -16,6 +16,8 @@ from jrigid.identify._sensors import AbstractSensor
 # that of theirs is no place to begin a segment.
 _LONE = 8.0
 _AROUND = 3  # samples to each side whose median is the path of rates
+# An attitude is far from most of those around it if it turned so many times as fast.
+_FAST = 3.0
 # Intervals that differ by more than this part are no equal ones.
 _UNEVEN = 0.1
 # Radians from one attitude to the next, twelve samples a turn.
@@ -282,6 +284,24 @@ def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray
     return result
 
 
+def _turned_far(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray:
+    """Which attitudes of a trial are far from most of those around them."""
+    place = np.flatnonzero(valid)
+    result = np.zeros_like(valid)
+    if place.size < 2 * _AROUND + 1:
+        return result
+    offsets = np.delete(np.arange(-_AROUND, _AROUND + 1), _AROUND)
+    # At the ends the samples inside stand for those that are missing.
+    other = np.arange(place.size)[:, None] + offsets
+    other = np.where((other < 0) | (other >= place.size), other - 2 * offsets, other)
+    t = ts[place]
+    q = attitude[place]
+    turns = np.linalg.norm(log(multiply(conjugate(q)[:, None], q[other])), axis=-1)
+    speeds = np.median(turns / np.abs(t[other] - t[:, None]), axis=1)
+    result[place] = speeds > _FAST * np.median(speeds)
+    return result
+
+
 def _leaping(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """Which rates of a trial leap from the medians of those around them."""
     del ts
@@ -315,8 +335,10 @@ def direct_readings_of(
     rates = _first_series(records, samples, "rates")
     attitudes = _first_series(records, samples, "attitude")
     if attitudes is not None and robust:
-        lone = _for_each_trial(_lone, *attitudes)
-        attitudes = attitudes._replace(valid=attitudes.valid & ~lone)
+        # Among many that leap, those that turned far from all around them go first.
+        for leaping in (_turned_far, _lone):
+            leaps = _for_each_trial(leaping, *attitudes)
+            attitudes = attitudes._replace(valid=attitudes.valid & ~leaps)
     if rates is not None and robust:
         leaping = _for_each_trial(_leaping, *rates)
         rates = rates._replace(valid=rates.valid & ~leaping)
