@@ -775,3 +775,23 @@ def test_another_solver_keeps_the_promise():
     np.testing.assert_allclose(default.states.omega, other.states.omega, atol=1e-6)
     energy = np.asarray(other.energy)
     assert np.all(np.abs(energy / energy[0] - 1) <= 1e-7 * (1 + ts))
+
+
+@pytest.mark.parametrize("adjoint", [None, diffrax.DirectAdjoint()])
+def test_derivatives_in_times_that_are_reached_beside_one_that_is_not(adjoint):
+    """The rates at the other time, where the torque is NaN, take no part."""
+
+    def torque(t, state, args):
+        return jnp.where(t > 1.5, jnp.nan, args) * jnp.array([0.1, -0.2, 0.05])
+
+    body = jr.RigidBody(jnp.array([1.0, 2.0, 2.5]), torque)
+    state0 = jr.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.3, 1.0, 0.2]))
+
+    def rate(time, times):
+        ts = jnp.append(time, times)
+        options = {"adjoint": adjoint, "throw": False}
+        return jr.simulate(body, state0, ts, 1.0, **options).states.omega[0, 0]
+
+    slope = quick_jit(jax.grad(rate))
+    beside = slope(1.0, jnp.array([2.0]))
+    np.testing.assert_allclose(beside, slope(1.0, jnp.array([1.2])), rtol=1e-7)

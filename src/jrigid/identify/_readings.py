@@ -15,7 +15,8 @@ from jrigid.identify._sensors import AbstractSensor
 # A reading so many times as far from the path of its neighbours as others are from
 # that of theirs is no place to begin a segment.
 _LONE = 8.0
-_AROUND = 3  # samples to each side whose median is the path of rates
+_AROUND = 3  # samples to each side that tell the path of the readings
+_WIDE = 10  # ... and how far readings are off from it
 # An attitude is far from most of those around it if it turned so many times as fast.
 _FAST = 3.0
 # Intervals that differ by more than this part are no equal ones.
@@ -298,7 +299,7 @@ def _turned_far(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.n
     q = attitude[place]
     turns = np.linalg.norm(log(multiply(conjugate(q)[:, None], q[other])), axis=-1)
     speeds = np.median(turns / np.abs(t[other] - t[:, None]), axis=1)
-    result[place] = speeds > _FAST * np.median(speeds)
+    result[place] = speeds > _FAST * _running_median(speeds[:, None], _WIDE)[:, 0]
     return result
 
 
@@ -310,11 +311,19 @@ def _leaping(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray
     if place.size < 2 * _AROUND + 1:
         return result
     known = rates[place]
-    around = np.pad(known, ((_AROUND, _AROUND), (0, 0)), mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * _AROUND + 1, axis=0)
-    off = np.max(np.abs(known - np.median(windows, axis=-1)), axis=1)
-    result[place] = off > _LONE * np.median(off)
+    off = np.abs(known - _running_median(known, _AROUND))
+    off = np.max(off, axis=1, keepdims=True)
+    # A body may turn slower and slower, so that rates are compared with those nearby.
+    result[place] = (off > _LONE * _running_median(off, _WIDE))[:, 0]
     return result
+
+
+def _running_median(values: np.ndarray, reach: int) -> np.ndarray:
+    """Medians over so many values to each side (n, k), or over all if there are fewer."""
+    reach = min(reach, len(values) - 1)
+    around = np.pad(values, ((reach, reach), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1, axis=0)
+    return np.median(windows, axis=-1)
 
 
 def direct_readings_of(

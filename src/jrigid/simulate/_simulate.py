@@ -306,9 +306,11 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
         given.field, motion, given.omega, options, event
     )
     result: Any = RESULTS.promote(result)
-    ys = _with_derivatives_in_times(given, options, motion.times, ys)
+    # A motion that is complete ends at the last output time but for rounding.
+    complete = (result == RESULTS.successful) & (event is None)
+    end = jnp.where(complete, motion.times[-1], t)
+    ys = _with_derivatives_in_times(given, options, motion.times, ys, end)
     if event is None:
-        complete = result == RESULTS.successful
         t, y = _end_without_event(motion.times, t, y, ys, complete)
     reached = jax.lax.stop_gradient(motion.times) <= jax.lax.stop_gradient(t)
     tried = jnp.asarray(stats["num_steps"], jnp.int32)
@@ -354,9 +356,11 @@ def _integrated(
     ends = solve(engine, motion)
     ys = ends.ys
     if conditions is None:
-        ys = _with_derivatives_in_times(given, options, given.times, ys)
         complete = ends.counts[0] == ENDED
         t = jax.lax.stop_gradient(ends.t)
+        # A motion that is complete ends at the last output time but for rounding.
+        end = jnp.where(complete, given.times[-1], t)
+        ys = _with_derivatives_in_times(given, options, given.times, ys, end)
         t, y = _end_without_event(given.times, t, ends.y, ys, complete)
     else:
         t, y = _end_at_event(given, options, conditions, motion, ends)
@@ -365,22 +369,37 @@ def _integrated(
         number = jnp.arange(given.times.size, dtype=ends.counts.dtype)
         missing = (number >= ends.counts[3]) & (given.times <= t)
         ys = jnp.where(missing[:, None], ends.y[None], ys)
-        ys = _with_derivatives_in_times(given, options, given.times, ys)
+        ys = _with_derivatives_in_times(given, options, given.times, ys, t)
     reached = jax.lax.stop_gradient(given.times) <= jax.lax.stop_gradient(t)
     result = _result_of(ends.counts[0])
     return _Solved(ys, reached, t, y, result, ends.counts[1], ends.counts[2])
 
 
 def _with_derivatives_in_times(
-    given: Prepared, options: Options, times: Array, ys: Array
+    given: Prepared, options: Options, times: Array, ys: Array, end: Array
 ) -> Array:
-    """States at the output times, whose derivatives in these times are the rates."""
-    fixed = jax.lax.stop_gradient(times)
+    """States at the output times, whose derivatives in these times are the rates.
+
+    Args:
+        given: The motion.
+        options: Of the integration.
+        times: Output times.
+        ys: States there.
+        end: Time at which the motion ended, beyond which rates need not be finite.
+    """
     is_direct = isinstance(options.adjoint, diffrax.DirectAdjoint)
     moved = moved_in_a_step if is_direct else moved_by
     later = jax.vmap(partial(moved, given.field, given.parameters))
-    # The difference is zero, but its derivatives are those of the times.
-    return later(fixed, ys, times - fixed)
+    fixed = jax.lax.stop_gradient(times)
+    is_reached = fixed <= jax.lax.stop_gradient(end)
+    # Others stay where they are, at the start, where rates are finite. The difference
+    # of the times is zero, but its derivatives are those of the times.
+    late = jnp.where(is_reached, times - fixed, 0.0)
+    fixed = jnp.where(is_reached, fixed, 0.0)
+    is_reached = is_reached[:, None]
+    start = jax.lax.stop_gradient(given.motion.y0)
+    ys = jnp.where(is_reached, ys, start)
+    return later(fixed, ys, late)
 
 
 def _end_at_event(
