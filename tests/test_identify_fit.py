@@ -1284,3 +1284,28 @@ def test_parts_inside_the_body_begin_in_the_state_that_is_given(part, rng):
     without = jr.State(start.attitude, start.omega)
     with pytest.raises(ValueError, match="the state of the parts inside the body"):
         identify.fit(body, record, scale=scale, start=without)
+
+
+def test_a_damper_s_coupling_is_found_beside_the_scale(rng):
+    """The first parts of a record say little of either, and a scale could go anywhere."""
+    moments = jnp.array([1.0, 1.6, 2.2])
+    internal = (jnp.zeros(3),)
+    start = jr.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.6, 1.2, 0.3]), internal)
+    true = jr.RigidBody(moments, jr.torques.InternalDamper(0.3, 0.1))
+    ts = jnp.linspace(0.0, 15.0, 151)
+    omega = jr.simulate(true, start, ts).states.omega
+    guess = jr.RigidBody(1.6 * jnp.ones(3), jr.torques.InternalDamper(0.3, 0.05))
+    for _ in range(6):
+        record = identify.Rates(ts, omega + 0.01 * rng.normal(size=omega.shape), 0.01)
+        found = identify.fit(
+            guess,
+            record,
+            free=lambda body, _: body.torque.coupling,
+            start=start,
+            scale="known",
+        )
+        assert found.status == identify.Status.OK
+        coupling, error = found.estimates["torque.coupling"]
+        assert abs(float(coupling) - 0.1) < 4 * float(error)
+        off = (found.moments - moments) / found.moments_errors
+        assert np.max(np.abs(off)) < 4

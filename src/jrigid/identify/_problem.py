@@ -104,8 +104,12 @@ class Problem(eqx.Module):
 
     @property
     def held(self) -> int:
-        """How many rows hold a fit near its start while part of the record is used."""
-        return self.unknowns.size - self.unknowns.slices["scale"].stop
+        """How many rows hold a fit near its start while part of the record is used.
+
+        They are those of all numbers but the inertia's: a few samples say little of
+        a scale, which could go anywhere.
+        """
+        return self.unknowns.size - self.unknowns.slices["scale"].start
 
 
 class _Trial(NamedTuple):
@@ -482,7 +486,7 @@ def _residuals(
         options, system, sensors, nodes, trial.layout, trial.samples
     )
     # Prior knowledge of the numbers of all trials must count once.
-    held = numbers[unknowns.slices["scale"].stop :]
+    held = numbers[unknowns.slices["scale"].start :]
     shared = trial.first * jnp.concatenate([unknowns.prior_rows(numbers), held])
     known = jnp.concatenate([unknowns.own_prior_rows(own), shared])[:, None]
     width = trial.samples.weight.shape[-1]
