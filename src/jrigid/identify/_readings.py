@@ -265,13 +265,28 @@ def _first_series(
     return None
 
 
-def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Which attitudes of a trial leap from the path of those before and after them."""
-    place = np.flatnonzero(valid)
-    t = ts[place]
-    q = attitude[place]
-    if t.size < 5:
-        return np.zeros_like(valid)
+_Leaps = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _without_leaps(series: _Series, leaps: _Leaps, fewest: int) -> _Series:
+    """The series without the readings that leap.
+
+    Args:
+        series: Of all trials.
+        leaps: Which readings of a trial leap, from the times and values of those that
+            there are.
+        fewest: Readings of a trial that tell which of them leap.
+    """
+    valid = series.valid.copy()
+    for ts, there, values in zip(series.ts, valid, series.values, strict=True):
+        place = np.flatnonzero(there)
+        if place.size >= fewest:
+            there[place] = ~leaps(ts[place], values[place])
+    return series._replace(valid=valid)
+
+
+def _lone(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Which attitudes leap from the path of those before and after them."""
     span = t[2:] - t[:-2]
     part = (t[1:-1] - t[:-2]) / np.where(span > 0, span, 1.0)
     turn = log(multiply(conjugate(q[:-2]), q[2:]))
@@ -280,48 +295,34 @@ def _lone(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray
     # A leap also bends the paths at its neighbours, by half as much.
     around = np.pad(off, 1)
     largest = (off >= around[:-2]) & (off >= around[2:])
-    result = np.zeros_like(valid)
-    result[place[1:-1]] = largest & (off > _LONE * np.median(off))
-    return result
+    # The first and the last one have a neighbour on one side only.
+    return np.pad(largest & (off > _LONE * np.median(off)), 1)
 
 
-def _turned_far(ts: np.ndarray, valid: np.ndarray, attitude: np.ndarray) -> np.ndarray:
-    """Which attitudes of a trial are far from most of those around them."""
-    place = np.flatnonzero(valid)
-    result = np.zeros_like(valid)
-    if place.size < 2 * _AROUND + 1:
-        return result
+def _turned_far(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Which attitudes are far from most of those around them."""
     offsets = np.delete(np.arange(-_AROUND, _AROUND + 1), _AROUND)
     # At the ends the samples inside stand for those that are missing.
-    other = np.arange(place.size)[:, None] + offsets
-    other = np.where((other < 0) | (other >= place.size), other - 2 * offsets, other)
-    t = ts[place]
-    q = attitude[place]
+    other = np.arange(t.size)[:, None] + offsets
+    other = np.where((other < 0) | (other >= t.size), other - 2 * offsets, other)
     turns = np.linalg.norm(log(multiply(conjugate(q)[:, None], q[other])), axis=-1)
     speeds = np.median(turns / np.abs(t[other] - t[:, None]), axis=1)
-    result[place] = speeds > _FAST * _running_median(speeds[:, None], _WIDE)[:, 0]
-    return result
+    return speeds > _FAST * _running_median(speeds, _WIDE)
 
 
-def _leaping(ts: np.ndarray, valid: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Which rates of a trial leap from the medians of those around them."""
-    del ts
-    place = np.flatnonzero(valid)
-    result = np.zeros_like(valid)
-    if place.size < 2 * _AROUND + 1:
-        return result
-    known = rates[place]
-    off = np.abs(known - _running_median(known, _AROUND))
-    off = np.max(off, axis=1, keepdims=True)
+def _leaping(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Which rates leap from the medians of those around them."""
+    del t
+    off = np.max(np.abs(rates - _running_median(rates, _AROUND)), axis=1)
     # A body may turn slower and slower, so that rates are compared with those nearby.
-    result[place] = (off > _LONE * _running_median(off, _WIDE))[:, 0]
-    return result
+    return off > _LONE * _running_median(off, _WIDE)
 
 
 def _running_median(values: np.ndarray, reach: int) -> np.ndarray:
-    """Medians over so many values to each side (n, k), or over all if there are fewer."""
+    """Medians over so many rows to each side, or over all if there are fewer."""
     reach = min(reach, len(values) - 1)
-    around = np.pad(values, ((reach, reach), (0, 0)), mode="reflect")
+    beyond = [(reach, reach), *[(0, 0)] * (values.ndim - 1)]
+    around = np.pad(values, beyond, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1, axis=0)
     return np.median(windows, axis=-1)
 
@@ -345,12 +346,10 @@ def direct_readings_of(
     attitudes = _first_series(records, samples, "attitude")
     if attitudes is not None and robust:
         # Among many that leap, those that turned far from all around them go first.
-        for leaping in (_turned_far, _lone):
-            leaps = _for_each_trial(leaping, *attitudes)
-            attitudes = attitudes._replace(valid=attitudes.valid & ~leaps)
+        attitudes = _without_leaps(attitudes, _turned_far, 2 * _AROUND + 1)
+        attitudes = _without_leaps(attitudes, _lone, 5)
     if rates is not None and robust:
-        leaping = _for_each_trial(_leaping, *rates)
-        rates = rates._replace(valid=rates.valid & ~leaping)
+        rates = _without_leaps(rates, _leaping, 2 * _AROUND + 1)
     if rates is None:
         if attitudes is None:
             return None
