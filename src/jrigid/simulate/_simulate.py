@@ -306,12 +306,12 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
         given.field, motion, given.omega, options, event
     )
     result: Any = RESULTS.promote(result)
-    # A motion that is complete ends at the last output time but for rounding.
+    # The last output has derivatives in its time, which the end of the loop has not.
+    # But for rounding they are the same.
     complete = (result == RESULTS.successful) & (event is None)
-    end = jnp.where(complete, motion.times[-1], t)
-    ys = _with_derivatives_in_times(given, options, motion.times, ys, end)
-    if event is None:
-        t, y = _end_without_event(motion.times, t, y, ys, complete)
+    t = jnp.where(complete, motion.times[-1], t)
+    ys = _with_derivatives_in_times(given, options, motion.times, ys, t)
+    y = jnp.where(complete, ys[-1], y)
     reached = jax.lax.stop_gradient(motion.times) <= jax.lax.stop_gradient(t)
     tried = jnp.asarray(stats["num_steps"], jnp.int32)
     accepted = jnp.asarray(stats["num_accepted_steps"], jnp.int32)
@@ -356,12 +356,12 @@ def _integrated(
     ends = solve(engine, motion)
     ys = ends.ys
     if conditions is None:
+        # The last output has derivatives in its time, which the end of the loop has
+        # not. But for rounding they are the same.
         complete = ends.counts[0] == ENDED
-        t = jax.lax.stop_gradient(ends.t)
-        # A motion that is complete ends at the last output time but for rounding.
-        end = jnp.where(complete, given.times[-1], t)
-        ys = _with_derivatives_in_times(given, options, given.times, ys, end)
-        t, y = _end_without_event(given.times, t, ends.y, ys, complete)
+        t = jnp.where(complete, given.times[-1], jax.lax.stop_gradient(ends.t))
+        ys = _with_derivatives_in_times(given, options, given.times, ys, t)
+        y = jnp.where(complete, ys[-1], ends.y)
     else:
         t, y = _end_at_event(given, options, conditions, motion, ends)
         # Output times within rounding of the event, or several at it, have no state of
@@ -422,15 +422,6 @@ def _end_at_event(
         ends.y,
         has_zero,
     )
-
-
-def _end_without_event(
-    times: Array, t: Array, y: Array, ys: Array, complete: Array
-) -> tuple[Array, Array]:
-    """Time and state at the end: those of the last output if the motion is complete."""
-    # The last output has derivatives in its time, which the end of the loop has not.
-    t = jnp.where(complete, times[-1], t)
-    return t, jnp.where(complete, ys[-1], y)
 
 
 def _result_of(state: Array) -> RESULTS:
