@@ -73,8 +73,9 @@ _LEVEL_STEPS = 6  # stages in which one that is known is reached
 _AT_REST = 0.02  # a change of the logarithms of its numbers that is none
 
 # Logarithms of values that are small enough in their unit, the largest first, and the
-# rise of chi-square that they may cost.
-_SMALL = (-7.0, -11.0, -15.0)
+# rise of chi-square that they may cost. All else is held where it is, so that a value
+# of a hundredth of its stated error can cost much.
+_SMALL = (-7.0, -11.0, -15.0, -19.0, -23.0)
 _NO_RISE = 0.01
 # Logarithms of elements of L of a body that is thicker than flat: the first one tried,
 # the thickest and the thinnest.
