@@ -484,6 +484,25 @@ def pushed(tensor, drag=0.02):
     return lambda _t, w: CONSTANT - drag * w
 
 
+def test_a_body_that_turned_a_hundred_times_in_a_gap_is_found_or_ambiguous(rng):
+    """One that turned once more or less describes the two parts of a record as well."""
+    ts = np.linspace(0.0, 20.0, 100)
+    ts = np.concatenate([ts, ts + 1000.0])
+    ended = []
+    for _ in range(6):
+        second = rng.uniform(0.1, 1.0, 3)
+        tensor = body_of(rng, np.sum(second) - second)
+        _, values = seen(rng, tensor, ts, 0.02)
+        found = fitted(values, 0.02, ts)
+        assert is_in(found, (Status.OK, Status.UNIDENTIFIABLE)), str(found)
+        if is_in(found, (Status.OK,)):
+            covers(found, tensor)
+        else:
+            assert "others far from it are nearly as good" in str(found)
+        ended.append(is_in(found, (Status.OK,)))
+    assert sum(ended) > 3
+
+
 @pytest.mark.slow  # a program of its own
 def test_a_known_thruster_and_a_known_drag_tell_the_tensor_blind(rng):
     """Or it is said why they do not."""

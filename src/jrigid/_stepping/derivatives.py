@@ -229,7 +229,7 @@ def _moved_by_jvp(field: _Field, primals: tuple, tangents: tuple) -> tuple:
     parameters, t, y, dt = primals
     *changes, dt_dot = tangents
     value = moved_by(field, parameters, t, y, dt)
-    changes = jtu.tree_map(_instantiated, changes)
+    changes = jtu.tree_map(_instantiated, tuple(changes), (parameters, t, y))
     parameters_dot, t_dot, y_dot = changes
 
     def of_both(parameters: PyTree, t: Array, both: PyTree) -> PyTree:
@@ -247,15 +247,19 @@ def _moved_by_jvp(field: _Field, primals: tuple, tangents: tuple) -> tuple:
     return value, total
 
 
-def _instantiated(tangent: PyTree) -> PyTree:
-    """A tangent as an array, where it is a symbolic zero."""
+def _instantiated(tangent: PyTree, value: Array) -> PyTree:
+    """The tangent of a value as an array, where it is a symbolic zero."""
     if not isinstance(tangent, jax.custom_derivatives.SymbolicZero):
         return tangent
     aval: Any = tangent.aval
     # The tangents of integers are numpy arrays of no size.
     if aval.dtype == jax.dtypes.float0:
         return np.zeros(aval.shape, aval.dtype)
-    return jnp.zeros(aval.shape, aval.dtype)
+    zeros = jnp.zeros(aval.shape, aval.dtype)
+    # JAX's vmap of a function with a rule takes the output to have an axis of lanes
+    # only if the inputs that it is computed from have one. These zeros have the axes of
+    # the value, so that what is added to them in a rule may have them.
+    return jax.lax.select(value == value, zeros, zeros)
 
 
 def moved_in_a_step(

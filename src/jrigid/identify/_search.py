@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from jrigid._types import AnyArray
 from jrigid.identify import _levels as levels
+from jrigid.identify._counts import gaps_of, places_beside
 from jrigid.identify._disturbance import Disturbance, GaussMarkov, no_disturbance
 from jrigid.identify._errors import Weakest, weakest
 from jrigid.identify._inertia_models import LOGARITHMS, Tensor
@@ -92,6 +93,8 @@ _HARD = 1e4  # weight of what a probe holds, in natural units
 _LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
 _SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
 _DISTINCT = 0.1  # natural units between two minima
+_BEYOND = 6.0  # standard errors from a fit that no error describes
+_BESIDE = 100  # steps to a minimum with another number of turns in a gap
 _FEW = 32  # numbers of a coarse record, too few to tell aliases
 # Times what Fisher's information says: a valley that no covariance describes.
 _BENT = 2.0
@@ -490,6 +493,10 @@ def search(case: Case) -> Search:
             # Probes begin where this fit began.
             case = case.alias
         ambiguous = ambiguous or rival
+    options = case.problem.options
+    if case.coarse and options.free_motion and not options.dense:
+        best, rival = yield from _among_counts(case, best)
+        ambiguous = ambiguous or rival
     best = yield from _off_zero(case, best)
     best = dataclasses.replace(best, ambiguous=ambiguous)
     if misfit(best) == 0 and not ambiguous and not case.problem.options.dense:
@@ -532,6 +539,71 @@ def _best_of_attempts(
             weak = other_weak
         index += 1
     return best, ambiguous
+
+
+def _among_counts(
+    case: Case, best: Fit
+) -> Generator[Request, Minimum, tuple[Fit, bool]]:
+    """The best of the minima that differ in the turns of the body in gaps.
+
+    Returns:
+        The fit, and whether another minimum is about as good or may have been missed.
+    """
+    last = stages_of(case, slow=False)[-1]
+    last = last._replace(steps=min(last.steps, _BESIDE))
+    noise = weakest(best).noise
+    fits = [best]
+    complete = True
+    for gap in gaps_of(best):
+        # Each side tells how the body turns. The one that predicts the other better is
+        # used.
+        found = []
+        for known, predicted in (gap.sides, gap.sides[::-1]):
+            kept = best.kept.copy()
+            kept[gap.trial] *= known
+            side = yield from _fitted_again(best, best.minimum.point, last, kept)
+            if side.minimum.settled:
+                found.append(places_beside(side, gap.trial, predicted, noise))
+        if not found:
+            continue
+        places = min(found, key=lambda x: x.angle)
+        complete = complete and places.complete
+        squares = []
+        for point in places.points:
+            there = yield _evaluation(case, best, best.problem, point)
+            squares.append(float(there.square))
+        for point in places.lowest(np.array(squares)):
+            fits.append((yield from _fitted_again(best, point, last, best.kept)))
+    squares = np.array([float(x.minimum.square) for x in fits])
+    found = fits[int(np.nanargmin(squares))]
+    is_near = squares - found.minimum.square < _RIVAL * noise
+    near = [x for x, is_good in zip(fits, is_near, strict=True) if is_good]
+    # What the errors of the fit allow is no other minimum.
+    rival = any(_distance(found, x) > _BEYOND * np.sqrt(noise) for x in near)
+    return found, rival or not complete
+
+
+def _distance(one: Fit, other: Fit) -> float:
+    """How far apart the numbers of two fits are, in errors of the first for noise 1."""
+    known = precision(one)
+    change = (
+        other.minimum.point.numbers - one.minimum.point.numbers
+    ) / one.minimum.units
+    return float(np.linalg.norm(known.values * (known.directions.T @ change)))
+
+
+def _fitted_again(fit: Fit, point: Point, stage: Stage, kept: np.ndarray) -> Search:
+    """The last stage of a fit from another point, with other samples."""
+    settings = _settings(stage, kept, fit.scales, fit.disturbance)
+    request = Request(fit.problem, fit.layout, point, settings)
+    minimum, history = yield from _stage(request)
+    return dataclasses.replace(
+        fit,
+        minimum=minimum,
+        kept=kept,
+        history=np.concatenate([fit.history, history]),
+        computed={},
+    )
 
 
 def _off_zero(case: Case, best: Fit) -> Search:

@@ -1,0 +1,166 @@
+"""How often a body turned in the long gaps of a record.
+
+A part of a record tells the rate at which the body turns with an error. Over a gap this
+error grows, and where it reaches half a turn the number of turns in the gap is a guess:
+there is a minimum of chi-square for each number. This module says where they are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jrigid._core.compile import small_program
+from jrigid.identify._independent import condensed_rows
+from jrigid.identify._precision import precision, reduced
+from jrigid.identify._quality import Fit, signal_of, weights_of
+from jrigid.identify._smoother import Move, Point, moved
+from jrigid.identify._unknowns import Unknowns
+
+_GAP = 3.5  # radians that a body turns in a gap
+_LONG = 10.0  # times the median interval of its trial that a gap lasts
+_GAPS = 4  # of a trial, the longest, that are looked at
+_SURE = 0.2  # radians: an error that leaves no doubt of the number of turns
+_FAR = 5.0  # standard errors to which other numbers of turns are looked for
+_STEP = 0.5  # radians between places to look at; minima are some six radians apart
+_MOST = 400  # places to look at beside one gap
+_SHOWN = 1e-7  # of the largest singular value: a direction that the record shows
+
+
+class Gap(NamedTuple):
+    """A gap in a trial, by which samples are on its two sides.
+
+    Attributes:
+        trial: The trial.
+        sides: Which samples come before it, and which come after it.
+    """
+
+    trial: int
+    sides: tuple[np.ndarray, np.ndarray]
+
+
+class Places(NamedTuple):
+    """Points from which all minima are found that one side of a gap allows.
+
+    Attributes:
+        angle: Error of what that side predicts of the other one [rad].
+        complete: Whether these are all the places that there are.
+        offsets: How far each one is from the first side's own motion, along each
+            direction that matters [steps] (places, directions).
+        points: The points.
+    """
+
+    angle: float
+    complete: bool
+    offsets: np.ndarray
+    points: list[Point]
+
+    def lowest(self, squares: np.ndarray) -> list[Point]:
+        """The places of which no neighbour has a smaller sum of squares."""
+        apart = np.abs(self.offsets[:, None] - self.offsets)
+        is_neighbour = np.all(apart < 1.5, axis=-1)
+        least = np.min(np.where(is_neighbour, squares, np.inf), axis=1)
+        return [self.points[i] for i in np.flatnonzero(squares <= least)]
+
+
+def gaps_of(fit: Fit) -> list[Gap]:
+    """The longest gaps of each trial, in which the body turns far."""
+    found = []
+    for trial, (ts, kept) in enumerate(zip(fit.layout.ts, fit.kept, strict=True)):
+        times = np.unique(ts[kept > 0])
+        if times.size < 3:
+            continue
+        intervals = np.diff(times)
+        rate = np.linalg.norm(fit.minimum.point.omega[trial, 0])
+        is_gap = intervals * rate > _GAP
+        is_gap &= intervals > _LONG * np.median(intervals)
+        longest = np.argsort(-np.where(is_gap, intervals, 0.0))[:_GAPS]
+        for index in np.sort(longest[is_gap[longest]]):
+            is_before = ts <= times[index]
+            sides = ((kept > 0) & is_before, (kept > 0) & ~is_before)
+            found.append(Gap(trial, sides))
+    return found
+
+
+def places_beside(fit: Fit, trial: int, predicted: np.ndarray, noise: float) -> Places:
+    """Where to look for minima that differ in the number of turns in a gap.
+
+    Args:
+        fit: Of the record without the samples on one side of the gap.
+        trial: The trial of the gap.
+        predicted: Those samples.
+        noise: Mean square of the residuals that is noise.
+    """
+    rows = condensed_rows(fit)
+    count = predicted.size
+    units = fit.minimum.units
+    # Unit vectors become changes of the numbers, and then of the state and own numbers,
+    # of one standard error. Numbers that this side does not show stay where they are.
+    known = precision(fit)
+    is_shown = known.values > _SHOWN * np.max(known.values, initial=0.0)
+    errors = known.directions[:, is_shown] / known.values[is_shown]
+    states = reduced(fit).states
+    seen = np.where(states.shown[trial], states.half[trial], 0.0)
+    none = np.zeros((units.size, seen.shape[1]))
+    of_numbers = np.concatenate([units[:, None] * errors, none], axis=1)
+    follows = known.sensitivity[trial] @ of_numbers[:, : errors.shape[1]]
+    of_local = np.concatenate([follows, seen], axis=1)
+    # What they do to the samples on the other side.
+    own = fit.minimum.point.own.shape[-1]
+    border = rows.of_border[trial, :count]
+    local = np.concatenate([rows.of_state[trial, :count], border[..., :own]], axis=-1)
+    effect = local @ of_local + border[..., own:] @ of_numbers
+    effect = effect[predicted].reshape(-1, effect.shape[-1])
+    signal = signal_of(fit.problem, weights_of(fit.problem, fit.problem.samples.seen))
+    signal = np.linalg.norm(signal[trial, predicted])
+    if not (signal > 0 and np.all(np.isfinite(effect))):
+        return Places(np.inf, False, np.zeros((0, 0)), [])
+    _, sizes, vt = np.linalg.svd(effect, full_matrices=False)
+    angles = np.sqrt(noise) * sizes / signal
+    # Two counts may be open, that of turns and that of wobbles.
+    large = angles[angles > _SURE][:2]
+    offsets, complete = _offsets(large)
+    changes = (offsets * _STEP * signal / sizes[: large.size]) @ vt[: large.size]
+    points = [
+        _point_moved(fit, trial, of_numbers @ change, of_local @ change)
+        for change in changes
+    ]
+    return Places(float(np.max(angles, initial=0.0)), complete, offsets, points)
+
+
+def _offsets(angles: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Where to look, in steps along directions with these standard errors [rad].
+
+    Returns:
+        Offsets (places, directions), and whether they reach as far as they should.
+    """
+    grid = np.zeros((1, 0))
+    complete = True
+    for angle in angles:
+        steps = int(np.ceil(_FAR * angle / _STEP))
+        most = (_MOST // len(grid) - 1) // 2
+        complete = complete and steps <= most
+        along = np.arange(-min(steps, most), min(steps, most) + 1.0)
+        grid = np.concatenate(
+            [np.column_stack([grid, np.full(len(grid), x)]) for x in along]
+        )
+    # Within an ellipse of so many standard errors, and one step beyond it.
+    beyond = _FAR + _STEP / np.min(angles, initial=np.inf)
+    is_inside = np.linalg.norm(grid * _STEP / angles, axis=1) <= beyond
+    return grid[is_inside], complete
+
+
+def _point_moved(fit: Fit, trial: int, numbers: np.ndarray, local: np.ndarray) -> Point:
+    """The point of a fit after a change of numbers, and of one trial's first state."""
+    point = fit.minimum.point
+    own = np.zeros_like(point.own)
+    states = np.zeros((*point.omega.shape[:2], local.size - own.shape[-1]))
+    states[trial, 0] = local[: states.shape[-1]]
+    own[trial] = local[states.shape[-1] :]
+    move = Move(numbers, own, states.astype(point.omega.dtype))
+    return _moved_by(fit.problem.unknowns, point, move)
+
+
+@small_program
+def _moved_by(unknowns: Unknowns, point: Point, move: Move) -> Point:
+    """A point after a change, on the path of the inertia model."""
+    return moved(point, move, unknowns.moved(point.numbers, move.numbers))
