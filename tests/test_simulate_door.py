@@ -299,6 +299,39 @@ def test_an_implicit_solver_locates_an_event():
     np.testing.assert_allclose(trajectory.final_time, 1.3, rtol=1e-5)
 
 
+@pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()], ids=["own", "diffrax"])
+def test_one_of_several_conditions_ends_a_motion_or_its_start(solver):
+    """In lanes: within the span, at the start by a number, at the start by a boolean."""
+
+    def late(_t, _state, args, **_):
+        return args[1]
+
+    event = diffrax.Event([lambda t, _state, args, **_: t - args[0], late])
+    state0 = jr.State(UPRIGHT, np.array([0.0, 0.0, 1.0]))
+
+    @quick_jit
+    @jax.vmap
+    def run(time, is_late):
+        return jr.simulate(
+            BODY,
+            state0,
+            np.array([0.0, 1.0, 5.0]),
+            (time, is_late),
+            event=event,
+            solver=solver,
+            rtol=1e-6,
+        )
+
+    times = jnp.array([1.3, 0.0, 4.0])
+    found = run(times, jnp.array([False, False, True]))
+    assert np.all(found.result == jr.RESULTS.event_occurred)
+    np.testing.assert_allclose(found.final_time, [1.3, 0.0, 0.0], atol=1e-12)
+    assert np.all(found.final_time >= 0)
+    np.testing.assert_allclose(found.states.omega[:, 0], [state0.omega] * 3)
+    reached = np.isfinite(found.states.omega[..., 2])
+    np.testing.assert_array_equal(reached, [[1, 1, 0], [1, 0, 0], [1, 0, 0]])
+
+
 # Stiffness
 # -----------------------------------------------------------------------------------
 

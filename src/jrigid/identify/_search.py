@@ -555,6 +555,7 @@ def _among_counts(
     fits = [best]
     complete = True
     for gap in gaps_of(best):
+        best = min(fits, key=lambda x: np.nan_to_num(x.minimum.square, nan=np.inf))
         # Each side tells how the body turns. The one that predicts the other better is
         # used.
         found = []

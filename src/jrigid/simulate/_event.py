@@ -119,4 +119,6 @@ def place_of_event(
             # bisection is then the result.
             usable = met & (slope != 0)
             dt = dt - jnp.where(usable, now / jnp.where(usable, slope, 1.0), 0.0)
+    # Rounding must not lead to a time before the start, where an event may be.
+    dt = dt - jax.lax.stop_gradient(jnp.minimum(t + dt, 0.0))
     return t + dt, later(dt)

@@ -5,7 +5,7 @@ Only documented parts of diffrax are used: terms, controllers, `diffeqsolve`.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -120,6 +120,108 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
         return rate_along(field, y, field(y), direction, self.scales)
 
 
+class _Bracket(NamedTuple):
+    """Times between which a condition changes its sign.
+
+    Attributes:
+        low: Before the change.
+        high: At the change, or after it.
+        signs: Of the conditions at the end of the step.
+        changing: Which of them have another sign at its start.
+    """
+
+    low: Array
+    high: Array
+    signs: Array
+    changing: Array
+
+
+class _FirstChange(optx.AbstractRootFinder):
+    """The first time in a step at which a condition has the sign that it ends with.
+
+    Optimistix's bisection takes a single condition, and none that is zero at the start.
+    """
+
+    rtol: float
+    atol: float
+    norm: ClassVar[Callable[[PyTree], Array]] = optx.max_norm
+
+    def init(
+        self,
+        fn: Callable[..., Any],
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        f_struct: PyTree,
+        aux_struct: PyTree,
+        tags: frozenset[object],
+    ) -> _Bracket:
+        """The step as a whole."""
+        del f_struct, aux_struct, tags
+        low = jnp.asarray(options["lower"], y.dtype)
+        high = jnp.asarray(options["upper"], y.dtype)
+        signs = _signs(fn, high, args)
+        # diffrax puts zero in place of conditions that did not end the step.
+        return _Bracket(low, high, signs, _signs(fn, low, args) != signs)
+
+    def step(
+        self,
+        fn: Callable[..., Any],
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _Bracket,
+        tags: frozenset[object],
+    ) -> tuple[Array, _Bracket, PyTree]:
+        """Halve the bracket."""
+        del y, options, tags
+        middle = state.low + 0.5 * (state.high - state.low)
+        values, aux = fn(middle, args)
+        late = jnp.any(state.changing & (_signs_of(values) == state.signs))
+        low = jnp.where(late, state.low, middle)
+        high = jnp.where(late, middle, state.high)
+        return high, state._replace(low=low, high=high), aux
+
+    def terminate(
+        self,
+        fn: Callable[..., Any],
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _Bracket,
+        tags: frozenset[object],
+    ) -> tuple[Array, optx.RESULTS]:
+        """Whether the bracket is short enough."""
+        del fn, y, args, options, tags
+        size = self.atol + self.rtol * jnp.abs(state.high)
+        return state.high - state.low <= size, optx.RESULTS.successful
+
+    def postprocess(
+        self,
+        fn: Callable[..., Any],
+        y: Array,
+        aux: PyTree,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _Bracket,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Array, PyTree, dict[str, Any]]:
+        """The time, as it is."""
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+def _signs(fn: Callable[..., Any], t: Array, args: PyTree) -> Array:
+    """Signs of all conditions at a time."""
+    return _signs_of(fn(t, args)[0])
+
+
+def _signs_of(values: PyTree) -> Array:
+    """Signs of the values of conditions."""
+    return jnp.sign(jnp.stack(jtu.tree_leaves(values)))
+
+
 def solve_by_diffrax(
     field: Field,
     motion: Motion,
@@ -143,8 +245,7 @@ def solve_by_diffrax(
     fixed = constant(motion)
     limits = fixed.limits
     if event is not None and event.root_finder is None:
-        # A condition may change its sign in either direction.
-        finder = optx.Bisection(_exactness(limits), _exactness(limits), flip="detect")
+        finder = _FirstChange(_exactness(limits), _exactness(limits))
         event = dataclasses.replace(event, root_finder=finder)
     solution = diffrax.diffeqsolve(
         _terms(field, fixed, options),
@@ -168,6 +269,8 @@ def solve_by_diffrax(
     )
     saved: Any = (solution.ts, solution.ys)
     (_, ends), (ys, end_ys) = saved
+    # diffrax saves no state where a condition is met at the start.
+    ys = jnp.where((fixed.times <= 0)[:, None], motion.y0, ys)
     return ys, ends[-1], end_ys[-1], solution.result, solution.stats
 
 
