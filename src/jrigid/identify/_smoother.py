@@ -54,9 +54,9 @@ class Move(NamedTuple):
             axes if the state has an attitude, then the unmodelled torque if it has one.
     """
 
-    numbers: Array
-    own: Array
-    states: Array
+    numbers: AnyArray
+    own: AnyArray
+    states: AnyArray
 
 
 class Rows(NamedTuple):
