@@ -503,6 +503,49 @@ def test_a_body_that_turned_a_hundred_times_in_a_gap_is_found_or_ambiguous(rng):
     assert sum(ended) > 3
 
 
+def test_ratios_have_errors_where_the_axes_have_none(rng):
+    """The body may be turned about a mark on it, which no direction of the mark shows.
+
+    The errors are those of a Fisher matrix by differences of scipy's motions, with the
+    turn left out.
+    """
+    mark = np.array([0.0, 0.6, 0.8])
+    ts = TS[::2]
+    tensor = body_of(rng)
+    omega0 = spin_of(rng, tensor)
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+
+    def shown(change):
+        moments, axes = np.linalg.eigh(tensor)
+        moments = moments * np.exp(np.append(0.0, change[:2]))
+        axes = axes @ Rotation.from_rotvec(change[2:5]).as_matrix()
+        first = omega0 + change[5:8]
+        turn = Rotation.from_rotvec(change[8:11])
+        inertia = axes @ np.diag(moments) @ axes.T
+        moved = worlds.tumble(inertia, first, ts, attitude0=upright)
+        attitudes = Rotation.from_quat(moved.attitude, scalar_first=True)
+        return (turn * attitudes).apply(mark)
+
+    steps = 1e-4 * np.eye(11)
+    slopes = np.stack([(shown(x) - shown(-x)).ravel() / 2e-4 for x in steps], axis=1)
+    covariance = np.linalg.pinv(slopes.T @ slopes / 0.01**2, rcond=1e-10)
+    moments = np.linalg.eigvalsh(tensor)
+    errors = np.sqrt(np.diag(covariance)[:2]) * moments[1:] / moments[0]
+
+    values = shown(np.zeros(11))
+    off = 0.01 * rng.normal(size=values.shape)
+    off -= np.sum(off * values, axis=1, keepdims=True) * values
+    values = (values + off) / np.linalg.norm(values + off, axis=1, keepdims=True)
+    record = identify.Directions(ts, values, 0.01, of=mark, frame="space")
+    start = (tensor, jr.State(upright, omega0))
+    found = identify.fit(BLIND, record, start=start, throw=False)
+    assert is_in(found, (Status.UNIDENTIFIABLE,)), str(found)
+    np.testing.assert_allclose(found.ratios_errors, errors, rtol=0.1)
+    far = np.abs(found.ratios - moments[1:] / moments[0]) / errors
+    assert np.all(far < 4), str(found)
+    assert "equal within their errors" not in str(found)
+
+
 @pytest.mark.slow  # a program of its own
 def test_a_known_thruster_and_a_known_drag_tell_the_tensor_blind(rng):
     """Or it is said why they do not."""

@@ -4,6 +4,7 @@ import re
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ TS = np.arange(200) * 0.01
 NOISE = 0.02
 DEGREES = 180 / np.pi
 SLOW = [0.4, 0.9, 0.5]  # rad/s
+in_body_axes = jax.vmap(jr.rotation.rotate_inverse, (0, None))
 
 
 def solved(ts, omega0, drag=0.0):
@@ -536,3 +538,52 @@ def test_readings_near_a_limit_that_is_passed_show_no_bias_but_a_true_one(rng, b
         if bias:
             assert "A bias of the gyro" in str(found).splitlines()[0]
     assert statuses == {int(Status.MISFIT if bias else Status.OK)}
+
+
+@pytest.fixture(scope="module")
+def with_magnetometer():
+    """A fit of a gyro and a magnetometer of one free motion, and its start."""
+    field = np.array([20.0, 0.0, -40.0])
+    ts = np.linspace(0.0, 20.0, 100)
+    start = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.4, 0.9, -0.5]))
+    motion = jr.free_rotation(MOMENTS, start, ts)
+    shown = in_body_axes(motion.attitude, jnp.asarray(field))
+    rng = np.random.default_rng(7)
+    rates = motion.omega + 0.02 * rng.normal(size=(100, 3))
+    shown = shown + 0.5 * rng.normal(size=(100, 3))
+
+    def fitted(late=0.0, unit=1.0):
+        records = (
+            identify.Record(identify.Gyro(), ts, rates, 0.02),
+            identify.Record(
+                identify.Magnetometer(field), ts + late, unit * shown, 0.5 * unit
+            ),
+        )
+        return identify.fit(BLIND, records, start=start, throw=False)
+
+    return fitted
+
+
+def test_records_that_have_no_time_in_common_are_named(with_magnetometer):
+    assert "no time in common" not in str(with_magnetometer())
+    text = str(with_magnetometer(late=1000.0))
+    assert "one ends 980 s before the other begins" in text
+
+
+def test_readings_in_another_unit_than_the_field_are_named(with_magnetometer):
+    found = with_magnetometer(unit=1000.0)
+    assert found.status not in (Status.OK, Status.UNIDENTIFIABLE)
+    assert re.search(r"size of 4\.\d+e\+04, and its field one of 44\.7", str(found))
+
+
+def test_a_search_without_rates_that_ends_wrong_says_what_it_needs():
+    """A state that turns the other way is no start."""
+    ts = np.linspace(0.0, 20.0, 100)
+    start = jr.State(np.array([1.0, 0, 0, 0]), np.array([0.4, 1.8, -0.5]))
+    motion = jr.free_rotation(MOMENTS, start, ts)
+    star = in_body_axes(motion.attitude, jnp.array([0.0, 0.6, 0.8]))
+    record = identify.Directions(ts, star, 0.01, of=np.array([0.0, 0.6, 0.8]))
+    wrong = jr.State(start.attitude, -np.asarray(start.omega))
+    found = identify.fit(BLIND, record, start=wrong, throw=False)
+    assert found.status not in (Status.OK, Status.UNIDENTIFIABLE)
+    assert "pass a tensor and a state (`start`)" in str(found)

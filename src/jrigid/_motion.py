@@ -239,7 +239,7 @@ def solver_of(
     if not isinstance(solver, diffrax.AbstractAdaptiveSolver | None):
         raise ValueError(
             "Argument `solver` must be a diffrax solver with an error estimate"
-            f"{or_else}, but it is {type(solver).__name__}."
+            f"{or_else}, but it is {kind_of(solver)}."
         )
     return default if solver is None else solver
 

@@ -28,6 +28,7 @@ from jrigid.identify._precision import (
     least_value,
     precision,
     precision_of,
+    turns_of,
     without_states,
 )
 from jrigid.identify._problem import Problem
@@ -45,6 +46,7 @@ from jrigid.identify._result import (
 from jrigid.identify._smoother import Rows
 from jrigid.identify._torque_errors import added_by_torque, fields_of_torque
 
+_OPEN = 10.0  # an error of a number of which nothing is known
 HISTORY = 512  # steps whose sums of squares are returned
 # Names of the fields of `derive` that state errors end so.
 _OF_ERRORS = ("_covariance", "_errors")
@@ -179,11 +181,31 @@ def _spread_of_moments(
         return np.zeros_like(unknown)
     if not np.all(np.isfinite(covariance[:size, :size])):
         return unknown
+    covariance = _without_turns(problem, numbers, covariance[:size, :size])
     points, scales = sigma_points(numbers, covariance, size)
     tensors = np.asarray(tensors_at(problem.unknowns, points))
     if not np.all(np.isfinite(tensors)):
         return unknown
     return spread_of(of_moments(np.linalg.eigvalsh(tensors)), scales)
+
+
+def _without_turns(
+    problem: Problem, numbers: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """The covariance without turns of the body of which nothing is known.
+
+    They change no moment, but a step along them by numbers does.
+    """
+    values, directions = np.linalg.eigh(covariance)
+    is_open = values > _OPEN**2
+    if not np.any(is_open):
+        return covariance
+    is_turn = turns_of(problem.unknowns, numbers)
+    others = np.zeros(numbers.size - len(values), numbers.dtype)
+    for value, direction in zip(values[is_open], directions.T[is_open], strict=True):
+        if is_turn(np.concatenate([direction, others])):
+            covariance = covariance - value * np.outer(direction, direction)
+    return covariance
 
 
 def _at_least_probed(

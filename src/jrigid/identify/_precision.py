@@ -3,6 +3,7 @@
 Plain numpy, on the host: small matrices, once for each fit.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,20 @@ import numpy as np
 from jrigid._numerics import or_one
 from jrigid.identify import _quality as quality
 from jrigid.identify._independent import independent_rows
+from jrigid.identify._minimise import spectrum
 from jrigid.identify._quality import Fit
 from jrigid.identify._smoother import Rows
+from jrigid.identify._unknowns import Unknowns
 
 # Of the largest singular value: a change of the state that the record shows.
 SHOWN = 1e-9
+# Of the largest singular value: a direction that the record does not show.
+_HIDDEN = 1e-10
+# Of the change of the tensor: the part that changes moments where it only turns.
+_NO_CHANGE = 1e-5
+# Natural units that the error of a turn has if the record does not show it. A larger
+# one would leave what is known of other numbers no digits in a covariance.
+_OF_TURN = 100.0
 
 
 class Precision(NamedTuple):
@@ -183,4 +193,35 @@ def reduced(fit: Fit) -> Reduced:
 @quality.once_for_each_fit
 def precision(fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
-    return precision_of(reduced(fit), fit.minimum.units)
+    units = fit.minimum.units
+    found = precision_of(reduced(fit), units)
+    is_hidden = found.values < _HIDDEN * np.max(found.values, initial=0.0)
+    if not np.any(is_hidden):
+        return found
+    is_turn = turns_of(fit.problem.unknowns, fit.minimum.point.numbers)
+    bounded = [
+        max(value, 1 / _OF_TURN) if hidden and is_turn(units * direction) else value
+        for value, hidden, direction in zip(
+            found.values, is_hidden, found.directions.T, strict=True
+        )
+    ]
+    values = np.array(bounded, found.values.dtype)
+    floor = 16 * np.finfo(values.dtype).eps * np.max(values) + least_value(values.dtype)
+    half = units[:, None] * found.directions / np.maximum(values, floor)
+    return found._replace(values=values, covariance=half @ half.T)
+
+
+def turns_of(unknowns: Unknowns, numbers: np.ndarray) -> Callable[[np.ndarray], bool]:
+    """Whether a change of the numbers turns the body, and changes no moment."""
+    _, moments, axes, slopes = map(np.asarray, spectrum(unknowns, numbers))
+
+    def is_turn(change: np.ndarray) -> bool:
+        inside = axes.T @ (slopes @ change) @ axes
+        size = np.linalg.norm(inside)
+        others = np.linalg.norm(change[unknowns.of_inertia.stop :])
+        is_small = size < np.linalg.norm(change) * moments[0] * 1e-3
+        if is_small or others > _NO_CHANGE * np.linalg.norm(change):
+            return False
+        return bool(np.linalg.norm(np.diagonal(inside)) < _NO_CHANGE * size)
+
+    return is_turn

@@ -16,7 +16,7 @@ from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments,
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
-from jrigid.identify._sensors import AttitudeSensor, Gyro
+from jrigid.identify._sensors import AttitudeSensor, Gyro, Magnetometer
 
 # I3/I1: degrees for radians shrink the gaps of the moments by a factor of 57.
 _NEARLY_A_SPHERE = 1.03
@@ -25,6 +25,8 @@ _TOO_FAST = 3.0
 _LOUD = 0.2  # part of the power that a swing has at its frequency
 # Difference of chi-square within which two errors of a gyro explain about as much.
 _LIKE = 16.0
+_OTHER_FIELD = 1.5  # times the size of a field: readings that are not of it
+_MUCH_LEFT = 0.05  # of the square of a record, by a fit that follows it
 _WHITE = 0.1  # correlation of neighbours
 _WHITE_SURE = 5.0  # standard deviations of that
 _FEWEST = 16  # samples whose spectrum says something
@@ -36,7 +38,7 @@ _MORE_THAN_NEXT = 5
 
 def reason(result: FitResult) -> str:
     """The sentences about a single fit, or an empty text without any."""
-    sentences = [_reason(result)]
+    sentences = [_reason(result), _of_clocks(result)]
     if result.numbers.dtype == np.float32 and result.status == Status.MISFIT:
         sentences.append(
             "It was computed in float32, whose rounding may be more than the noise: "
@@ -100,7 +102,75 @@ def _reason(result: FitResult) -> str:
             "The level of the unmodelled torque has no bound or no error: the record "
             "does not tell it from noise. Pass `sigma`, or the torque (`unmodelled`)."
         )
-    return _of_limit(result) or _of_gyro(result) or _of_noise(result)
+    return (
+        _of_limit(result)
+        or _of_field(result)
+        or _of_gyro(result)
+        or " ".join(filter(None, [_of_noise(result), _of_minimum(result)]))
+    )
+
+
+def _of_clocks(result: FitResult) -> str:
+    """A sentence about records of one motion that have no time in common."""
+    samples = result.problem.samples
+    for ts, is_seen in zip(
+        np.asarray(samples.ts), np.asarray(samples.seen), strict=True
+    ):
+        times = [ts[part][is_seen[part]] for part in samples.parts]
+        spans = [(np.min(x), np.max(x)) for x in times if x.size]
+        latest_start = max((first for first, _ in spans), default=0.0)
+        earliest_end = min((last for _, last in spans), default=0.0)
+        if latest_start > earliest_end:
+            return (
+                "Two records of the motion have no time in common: one ends "
+                f"{latest_start - earliest_end:.3g} s before the other begins. Their "
+                "times must be those of one clock."
+            )
+    return ""
+
+
+def _of_field(result: FitResult) -> str:
+    """A sentence about a magnetometer whose field has another size than the readings."""
+    samples = result.problem.samples
+    is_biased = any("magnetometer.bias" in x.name for x in result.unknowns.sought)
+    for sensor, values, part in zip(
+        result.fitted()[1:], samples.values, samples.parts, strict=True
+    ):
+        if not isinstance(sensor, Magnetometer) or is_biased:
+            continue
+        is_seen = np.asarray(samples.seen)[:, part]
+        read = np.median(np.linalg.norm(np.asarray(values)[is_seen], axis=-1))
+        size = np.linalg.norm(np.asarray(sensor.field))
+        if not 1 / _OTHER_FIELD < read / max(size, 1e-300) < _OTHER_FIELD:
+            return (
+                f"The readings of the magnetometer have a size of {read:.3g}, and its "
+                f"field one of {size:.3g}: they must be in one unit."
+            )
+    return ""
+
+
+def _of_minimum(result: FitResult) -> str:
+    """What to try where the search may have ended in a wrong minimum."""
+    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
+    unexplained = float(result.diagnostics.unexplained)
+    left = result.status == Status.MISFIT and unexplained > _MUCH_LEFT
+    # Where rates or attitudes are read, they show where the search begins.
+    is_seen = any(isinstance(x, Gyro | AttitudeSensor) for x in result.fitted()[1:])
+    if not (failed or left):
+        return ""
+    sentence = ""
+    if left:
+        sentence = (
+            f"A part of {unexplained:.2g} of the square of the record is left: the "
+            "search may have ended in a wrong minimum. "
+        )
+    if is_seen:
+        return sentence.strip()
+    return sentence + (
+        "No sensor reads rates or attitudes, so that the search depends on where it "
+        "begins: pass a tensor and a state (`start`), or first fit a part of the "
+        "record in which the body turns a few times."
+    )
 
 
 def _may_turn_the_other_way(result: FitResult) -> bool:
