@@ -58,7 +58,8 @@ class Places(NamedTuple):
         """The places of which no neighbour has a smaller sum of squares."""
         apart = np.abs(self.offsets[:, None] - self.offsets)
         is_neighbour = np.all(apart < 1.5, axis=-1)
-        least = np.min(np.where(is_neighbour, squares, np.inf), axis=1)
+        near = np.where(is_neighbour, squares, np.inf)
+        least = np.min(near, axis=1, initial=np.inf)
         return [self.points[i] for i in np.flatnonzero(squares <= least)]
 
 
@@ -81,50 +82,71 @@ def gaps_of(fit: Fit) -> list[Gap]:
     return found
 
 
-def places_beside(fit: Fit, trial: int, predicted: np.ndarray, noise: float) -> Places:
+def places_beside(
+    side: Fit, whole: Fit, trial: int, predicted: np.ndarray, noise: float
+) -> Places:
     """Where to look for minima that differ in the number of turns in a gap.
 
     Args:
-        fit: Of the record without the samples on one side of the gap.
+        side: A fit of the record without the samples on one side of the gap.
+        whole: A fit of the record.
         trial: The trial of the gap.
-        predicted: Those samples.
+        predicted: The samples on the other side.
         noise: Mean square of the residuals that is noise.
     """
-    rows = condensed_rows(fit)
-    count = predicted.size
-    units = fit.minimum.units
-    # Unit vectors become changes of the numbers, and then of the state and own numbers,
-    # of one standard error. Numbers that this side does not show stay where they are.
-    known = precision(fit)
-    is_shown = known.values > _SHOWN * np.max(known.values, initial=0.0)
-    errors = known.directions[:, is_shown] / known.values[is_shown]
-    states = reduced(fit).states
-    seen = np.where(states.shown[trial], states.half[trial], 0.0)
-    none = np.zeros((units.size, seen.shape[1]))
-    of_numbers = np.concatenate([units[:, None] * errors, none], axis=1)
-    follows = known.sensitivity[trial] @ of_numbers[:, : errors.shape[1]]
-    of_local = np.concatenate([follows, seen], axis=1)
-    # What they do to the samples on the other side.
-    own = fit.minimum.point.own.shape[-1]
-    border = rows.of_border[trial, :count]
-    local = np.concatenate([rows.of_state[trial, :count], border[..., :own]], axis=-1)
-    effect = local @ of_local + border[..., own:] @ of_numbers
-    effect = effect[predicted].reshape(-1, effect.shape[-1])
-    signal = signal_of(fit.problem, weights_of(fit.problem, fit.problem.samples.seen))
-    signal = np.linalg.norm(signal[trial, predicted])
-    if not (signal > 0 and np.all(np.isfinite(effect))):
+    of_numbers, of_local = _errors(side, trial)
+    # A side that says nothing of some number predicts nothing of the other.
+    says_all = of_numbers.shape[1] >= _errors(whole, trial)[0].shape[1]
+    effect = _effect(side, trial, of_numbers, of_local)[predicted]
+    signal = signal_of(side.problem, weights_of(side.problem, whole.kept))
+    size = np.linalg.norm(signal[trial, predicted])
+    if not (says_all and size > 0 and np.all(np.isfinite(effect))):
         return Places(np.inf, False, np.zeros((0, 0)), [])
+    effect = effect.reshape(-1, effect.shape[-1])
     _, sizes, vt = np.linalg.svd(effect, full_matrices=False)
-    angles = np.sqrt(noise) * sizes / signal
+    angles = np.sqrt(noise) * sizes / size
     # Two counts may be open, that of turns and that of wobbles.
     large = angles[angles > _SURE][:2]
     offsets, complete = _offsets(large)
-    changes = (offsets * _STEP * signal / sizes[: large.size]) @ vt[: large.size]
+    changes = (offsets * _STEP * size / sizes[: large.size]) @ vt[: large.size]
     points = [
-        _point_moved(fit, trial, of_numbers @ change, of_local @ change)
+        _point_moved(side, trial, of_numbers @ change, of_local @ change)
         for change in changes
     ]
     return Places(float(np.max(angles, initial=0.0)), complete, offsets, points)
+
+
+def _errors(fit: Fit, trial: int) -> tuple[np.ndarray, np.ndarray]:
+    """Changes by one standard error, in columns, of all that a fit determines.
+
+    Returns:
+        Changes of the numbers (numbers, columns), and those of one trial's first state
+        and own numbers that go with them (local, columns).
+    """
+    known = precision(fit)
+    is_shown = known.values > _SHOWN * np.max(known.values, initial=0.0)
+    units = fit.minimum.units[:, None]
+    of_numbers = units * known.directions[:, is_shown] / known.values[is_shown]
+    follows = known.sensitivity[trial] @ of_numbers
+    states = reduced(fit).states
+    of_state = states.half[trial][:, states.shown[trial]]
+    still = np.zeros((len(of_numbers), of_state.shape[1]))
+    return (
+        np.concatenate([of_numbers, still], axis=1),
+        np.concatenate([follows, of_state], axis=1),
+    )
+
+
+def _effect(
+    fit: Fit, trial: int, of_numbers: np.ndarray, of_local: np.ndarray
+) -> np.ndarray:
+    """What changes do to the whitened samples of a trial (samples, degrees, columns)."""
+    rows = condensed_rows(fit)
+    count = fit.kept.shape[1]
+    own = fit.minimum.point.own.shape[-1]
+    border = rows.of_border[trial, :count]
+    local = np.concatenate([rows.of_state[trial, :count], border[..., :own]], axis=-1)
+    return local @ of_local + border[..., own:] @ of_numbers
 
 
 def _offsets(angles: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -564,8 +564,9 @@ def _among_counts(
             kept[gap.trial] *= known
             side = yield from _fitted_again(best, best.minimum.point, last, kept)
             if side.minimum.settled:
-                found.append(places_beside(side, gap.trial, predicted, noise))
+                found.append(places_beside(side, best, gap.trial, predicted, noise))
         if not found:
+            complete = False
             continue
         places = min(found, key=lambda x: x.angle)
         complete = complete and places.complete
