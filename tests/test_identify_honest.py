@@ -544,6 +544,8 @@ def test_ratios_have_errors_where_the_axes_have_none(rng):
     far = np.abs(found.ratios - moments[1:] / moments[0]) / errors
     assert np.all(far < 4), str(found)
     assert "equal within their errors" not in str(found)
+    low, high = np.asarray(found.ratios_intervals)
+    assert np.all((low >= 1) & (low < found.ratios) & (found.ratios < high))
 
 
 @pytest.mark.slow  # a program of its own

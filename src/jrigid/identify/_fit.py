@@ -108,7 +108,8 @@ def fit(
 ) -> FitResult:
     r"""Estimate the inertia of a rotating body and other parameters from observations.
 
-    No initial values are needed where rates or attitudes were observed. Linear
+    No initial values are needed where rates or attitudes were observed, but for a rough
+    attitude beside sensors that depend on it (a gyro and a magnetometer). Linear
     equations in the tensor give them, multiple shooting brings them into the basin of
     the minimum, and Levenberg-Marquardt ends there. Free motion is evaluated by the
     exact flow.
@@ -136,8 +137,8 @@ def fit(
         start: Initial values: a `State` at each trial's first sample (`t0` of the
             result), of one trial or with an axis of trials in front; or a tuple
             (inertia or None, State or None). A state is needed where the attitude
-            matters and was not observed; an error below about half a turn is small
-            enough. Attitudes at equal intervals are also those of a body that turns the
+            matters and was not observed; an error of a third of a turn is nearly always
+            small enough, and rates that were read may be zero in it. Attitudes at equal intervals are also those of a body that turns the
             other way round between them: a state says which. Parts that move inside
             the body (`torques.SpinningMass`, `torques.InternalDamper`) begin in the
             state that is given, the same for all trials; they are not sought.

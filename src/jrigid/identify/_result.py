@@ -294,7 +294,9 @@ class FitResult(eqx.Module):
         # The index is an array of a pytree, so that both ratios share one compiled
         # program.
         ratios = [jtu.Partial(_one_of_moments, jnp.asarray(i)) for i in (3, 4)]
-        return jnp.stack([self.interval(x) for x in ratios], axis=1)
+        limits = jnp.stack([self.interval(x) for x in ratios], axis=1)
+        # A straight line in the numbers may lead below what sorted moments can have.
+        return jnp.maximum(limits, 1.0)
 
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
