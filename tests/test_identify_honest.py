@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import jrigid as jr
 from jrigid import identify
 from jrigid.identify import Status
+from jrigid.identify._readings import _turn_between
 
 BLIND = jr.RigidBody(np.ones(3))
 TS = np.arange(200) * 0.3  # ten turns at a radian a second, twenty samples each
@@ -501,6 +502,60 @@ def test_a_body_that_turned_a_hundred_times_in_a_gap_is_found_or_ambiguous(rng):
             assert "others far from it are nearly as good" in str(found)
         ended.append(is_in(found, (Status.OK,)))
     assert sum(ended) > 3
+
+
+@pytest.mark.parametrize("vectors", [1, 2])
+def test_vectors_beside_a_gyro_tell_the_attitude(rng, vectors):
+    """Of a body at any attitude, without `start`; one vector does not tell a heading."""
+    in_space = np.array([[20.0, 0.0, -40.0], [1.0, 2.0, 0.0]])[:vectors]
+    for _ in range(5):
+        tensor = body_of(rng)
+        attitude0 = Rotation.random(random_state=rng.integers(10**6))
+        omega0 = spin_of(rng, tensor)
+        q0 = attitude0.as_quat(scalar_first=True)
+        moved = worlds.tumble(tensor, omega0, TS, attitude0=q0)
+        back = Rotation.from_quat(moved.attitude, scalar_first=True).inv()
+        bias = np.array([2.0, -1.0, 3.0])
+        field = back.apply(in_space[0]) + bias + 0.5 * rng.normal(size=(200, 3))
+        rates = moved.omega + 0.01 * rng.normal(size=(200, 3))
+        records = [
+            identify.Rates(TS, rates, 0.01),
+            identify.Record(identify.Magnetometer(in_space[0]), TS, field, 0.5),
+        ]
+        if vectors == 2:
+            shown = back.apply(in_space[1] / np.sqrt(5)) + 0.01 * rng.normal(
+                size=(200, 3)
+            )
+            shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+            records.append(identify.Directions(TS, shown, 0.01, of=in_space[1]))
+        found = identify.fit(
+            BLIND, tuple(records), free=lambda _body, _gyro, field, *_: field.bias
+        )
+        assert is_in(found, (Status.OK,)), str(found)
+        covers(found, tensor)
+        value, error = found.estimates["magnetometer.bias"]
+        assert np.all(np.abs(value - bias) < 5 * error)
+        off = (
+            Rotation.from_quat(found.state.attitude, scalar_first=True)
+            * attitude0.inv()
+        )
+        size = np.linalg.norm(in_space[0])
+        assert np.linalg.norm(off.apply(in_space[0]) - in_space[0]) < 0.02 * size
+        if vectors == 2:
+            assert off.magnitude() < 0.02
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_turn_between_vectors_is_the_smallest(rng, count):
+    start = rng.normal(size=(count, 3))
+    start /= np.linalg.norm(start, axis=1, keepdims=True)
+    turn = Rotation.random(random_state=rng.integers(10**6))
+    end = turn.apply(start)
+    found = Rotation.from_quat(_turn_between(start, end), scalar_first=True)
+    np.testing.assert_allclose(found.apply(start), end, atol=1e-5)
+    if count == 1:
+        angle = np.arccos(np.sum(start * end))
+        np.testing.assert_allclose(found.magnitude(), angle, atol=1e-5)
 
 
 def test_ratios_have_errors_where_the_axes_have_none(rng):

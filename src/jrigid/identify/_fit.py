@@ -51,6 +51,7 @@ from jrigid.identify._readings import (
     direct_readings_of,
     longest_turn,
     other_way_round,
+    vector_in_space,
 )
 from jrigid.identify._reasons import reason
 from jrigid.identify._records import (
@@ -73,6 +74,7 @@ from jrigid.identify._search import (
     run,
     search,
 )
+from jrigid.identify._sensors import AbstractSensor
 from jrigid.identify._smoother import Point
 from jrigid.identify._starts import linear_starts
 from jrigid.identify._unknowns import Unknowns, are_alike, unknowns_of
@@ -108,11 +110,10 @@ def fit(
 ) -> FitResult:
     r"""Estimate the inertia of a rotating body and other parameters from observations.
 
-    No initial values are needed where rates or attitudes were observed, but for a rough
-    attitude beside sensors that depend on it (a gyro and a magnetometer). Linear
+    No initial values are needed where rates or attitudes were observed. Linear
     equations in the tensor give them, multiple shooting brings them into the basin of
-    the minimum, and Levenberg-Marquardt ends there. Free motion is evaluated by the
-    exact flow.
+    the minimum, and Levenberg-Marquardt ends there. Beside rates, known directions and
+    fields tell the attitude of a free body. Free motion is evaluated by the exact flow.
 
     Args:
         system: The body, with its torque. What is known of its tensor is said by
@@ -137,11 +138,11 @@ def fit(
         start: Initial values: a `State` at each trial's first sample (`t0` of the
             result), of one trial or with an axis of trials in front; or a tuple
             (inertia or None, State or None). A state is needed where the attitude
-            matters and was not observed; an error of a third of a turn is nearly always
-            small enough, and rates that were read may be zero in it. Attitudes at equal intervals are also those of a body that turns the
-            other way round between them: a state says which. Parts that move inside
-            the body (`torques.SpinningMass`, `torques.InternalDamper`) begin in the
-            state that is given, the same for all trials; they are not sought.
+            matters and no sensor tells it; beside rates that were read its own rates
+            may be zero. Attitudes at equal intervals are also those of a body that
+            turns the other way round between them: a state says which. Parts that move
+            inside the body (`torques.SpinningMass`, `torques.InternalDamper`) begin in
+            the state that is given, the same for all trials; they are not sought.
         unmodelled: An unmodelled torque. It is the level [N m sqrt(s)] of a white
             torque, for all body axes or for each (its spectral density is the level
             squared); a `GaussMarkov`, which has a correlation time; or "estimate". A
@@ -500,13 +501,23 @@ def _shoots(
 ) -> bool:
     """Whether each segment has a state of its own; ValueError if no fit can begin."""
     by_attitude = any(tells(x, "attitude") for x in records)
+    by_rates = any(tells(x, "rates") for x in records)
+    # A free body looks the same from all sides but for the vectors that sensors show.
+    by_vectors = (
+        by_rates
+        and options.free_motion
+        and all(_shows_attitude(x.sensor) for x in records)
+    )
     demand(
-        not options.depends_on_attitude or state is not None or by_attitude,
+        not options.depends_on_attitude
+        or state is not None
+        or by_attitude
+        or by_vectors,
         "Argument `start` must hold a State whose attitude the fit can start from, "
         "since the motion or an observation depends on the attitude and none was "
         "observed, but it does not.",
     )
-    observed = by_attitude or any(tells(x, "rates") for x in records)
+    observed = by_attitude or by_rates
     # The state of a part inside the body is not read directly, so that a segment could
     # not begin with it.
     shooting = observed and options.motion is None and not bodies.carry_parts
@@ -522,6 +533,11 @@ def _shoots(
         "observed, a part moves inside the body or `motion` is given, but it is not.",
     )
     return shooting
+
+
+def _shows_attitude(sensor: AbstractSensor) -> bool:
+    """Whether a sensor shows the attitude by a vector, or does not depend on it."""
+    return not sensor.depends_on_attitude or vector_in_space(sensor) is not None
 
 
 class _Observed(NamedTuple):
@@ -586,6 +602,20 @@ def _observed(
         coarse = longest_turn(readings) > np.pi
     noise = noise_of(records, samples, rate)
     return _Observed(samples, readings, alias, rate, sizes, angle, coarse, noise)
+
+
+def _first_attitude(
+    records: tuple[Record, ...], state: State | None, options: Options
+) -> np.ndarray | None:
+    """Attitude of each trial from which rates are integrated, if anything depends on it."""
+    if not options.depends_on_attitude:
+        return None
+    dtype = records[0].values.dtype
+    if state is not None:
+        return state.attitude.astype(dtype)
+    # Vectors that sensors show turn this one: see `_shoots`.
+    upright = np.array([1.0, 0.0, 0.0, 0.0], dtype)
+    return np.tile(upright, (len(records[0].ts), 1))
 
 
 class _Opening(NamedTuple):
@@ -655,9 +685,7 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     if options.motion is None:  # which may ask for times that increase
         records = tuple(lengthened(x) for x in records)
     dtype = records[0].values.dtype
-    attitude0 = None
-    if state is not None and options.depends_on_attitude:
-        attitude0 = state.attitude.astype(dtype)
+    attitude0 = _first_attitude(records, state, options)
     observed = _observed(records, state, attitude0, options.robust)
     input_result = _judged(task, records, observed, throw)
     given = _unknowns(task, records, observed)

@@ -8,9 +8,20 @@ import numpy as np
 
 from jrigid._core.compile import Static, small_program
 from jrigid._types import AnyArray
-from jrigid.identify._host import conjugate, exp, log, multiply, normalize
+from jrigid.identify._host import (
+    conjugate,
+    exp,
+    log,
+    multiply,
+    normalize,
+    to_matrix,
+)
 from jrigid.identify._records import Record, Samples, first_and_last, tells
-from jrigid.identify._sensors import AbstractSensor
+from jrigid.identify._sensors import (
+    AbstractSensor,
+    DirectionSensor,
+    Magnetometer,
+)
 
 # A reading so many times as far from the path of its neighbours as others are from
 # that of theirs is no place to begin a segment.
@@ -22,6 +33,8 @@ _FAST = 3.0
 # Intervals that differ by more than this part are no equal ones.
 _UNEVEN = 0.1
 # Radians from one attitude to the next, twelve samples a turn.
+_SHOWN = 0.3  # of a vector: the least mean of its readings in space axes
+_LEAST_TURN = 1e-6  # weight of the smallest turn among those that serve as well
 _SMALL_TURN = 0.5
 # Rates are taken from the attitudes within a turn that is so little [rad] ...
 _LITTLE = 1.0
@@ -365,7 +378,86 @@ def direct_readings_of(
     if attitudes is None:
         return DirectReadings(ts, valid, omega, None)
     attitude = _for_each_trial(_dead_reckoning, ts, valid, omega, *attitudes)
-    return DirectReadings(ts, valid, omega, attitude)
+    readings = DirectReadings(ts, valid, omega, attitude)
+    if any(tells(x, "attitude") for x in records):
+        return readings
+    return readings._replace(attitude=_turned_to_vectors(records, samples, readings))
+
+
+def vector_in_space(sensor: AbstractSensor) -> np.ndarray | None:
+    """The vector in space axes that the values of a sensor are in body axes, if any."""
+    if isinstance(sensor, Magnetometer):
+        return np.asarray(sensor.field)
+    if isinstance(sensor, DirectionSensor) and sensor.frame == "body":
+        return np.asarray(sensor.of)
+    return None
+
+
+def _turned_to_vectors(
+    records: tuple[Record, ...], samples: Samples, readings: DirectReadings
+) -> np.ndarray:
+    """Attitudes of dead reckoning, turned in space to where sensors show vectors.
+
+    Rates tell an attitude but for that at the start. In space axes all readings of a
+    vector are the same, but for errors that the body's turning averages out.
+
+    Source: F. L. Markley, "Attitude determination using vector observations and the
+    singular value decomposition" (1988).
+    """
+    attitude = readings.attitude
+    assert attitude is not None
+    turned = attitude.copy()
+    for trial in range(len(attitude)):
+        seen = []
+        for record, part, values in zip(
+            records, samples.parts, samples.values, strict=True
+        ):
+            vector = vector_in_space(record.sensor)
+            degrees = record.sensor.degrees or values.shape[-1]
+            is_seen = np.all(samples.weight[trial, part, :degrees] > 0, axis=-1)
+            if vector is None or not np.any(is_seen):
+                continue
+            q = _attitudes_at(readings, trial, samples.ts[trial, part][is_seen])
+            in_space = np.einsum(
+                "nij,nj->ni", to_matrix(q), np.asarray(values)[trial][is_seen]
+            )
+            shown = np.mean(in_space, axis=0) / np.linalg.norm(vector)
+            if np.linalg.norm(shown) > _SHOWN:
+                seen.append((shown, vector / np.linalg.norm(vector)))
+        if seen:
+            turn = _turn_between(*map(np.stack, zip(*seen, strict=True)))
+            turned[trial] = multiply(turn, attitude[trial])
+    return turned.astype(attitude.dtype)
+
+
+def _attitudes_at(readings: DirectReadings, trial: int, ts: np.ndarray) -> np.ndarray:
+    """Attitudes at any times, each from the last reading of the rates before it."""
+    assert readings.attitude is not None
+    at = np.maximum(_nearest_before(readings.ts[trial], readings.valid[trial], ts), 0)
+    late = ts - readings.ts[trial, at]
+    return turned_by(readings.attitude[trial, at], readings.omega[trial, at], late)
+
+
+def _turn_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The quaternion of the turn that brings vectors (n, 3) nearest to unit vectors.
+
+    A single vector is turned by the smallest angle.
+    """
+    # Of Davenport's matrix K the eigenvector of the largest value. The small number
+    # selects the smallest of the turns that serve as well.
+    matrix = start.T @ end
+    z = np.array(
+        [
+            matrix[1, 2] - matrix[2, 1],
+            matrix[2, 0] - matrix[0, 2],
+            matrix[0, 1] - matrix[1, 0],
+        ]
+    )
+    k = np.zeros((4, 4))
+    k[0, 0] = np.trace(matrix) + _LEAST_TURN
+    k[0, 1:] = k[1:, 0] = z
+    k[1:, 1:] = matrix + matrix.T - np.trace(matrix) * np.eye(3)
+    return np.linalg.eigh(k)[1][:, -1]
 
 
 def _for_each_trial(
