@@ -612,7 +612,7 @@ def _first_attitude(
         return None
     dtype = records[0].values.dtype
     if state is not None:
-        return state.attitude.astype(dtype)
+        return np.asarray(state.attitude, dtype)
     # Vectors that sensors show turn this one: see `_shoots`.
     upright = np.array([1.0, 0.0, 0.0, 0.0], dtype)
     return np.tile(upright, (len(records[0].ts), 1))
@@ -684,7 +684,6 @@ def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
     records, state, tensor = on_host((task.records, task.state, task.tensor))
     if options.motion is None:  # which may ask for times that increase
         records = tuple(lengthened(x) for x in records)
-    dtype = records[0].values.dtype
     attitude0 = _first_attitude(records, state, options)
     observed = _observed(records, state, attitude0, options.robust)
     input_result = _judged(task, records, observed, throw)
