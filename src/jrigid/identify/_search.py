@@ -549,26 +549,28 @@ def _among_counts(
     Returns:
         The fit, and whether another minimum is about as good or may have been missed.
     """
+    if not np.isfinite(best.minimum.square):
+        return best, False
     last = stages_of(case, slow=False)[-1]
     last = last._replace(steps=min(last.steps, _BESIDE))
     noise = weakest(best).noise
     fits = [best]
     complete = True
     for gap in gaps_of(best):
-        best = min(fits, key=lambda x: np.nan_to_num(x.minimum.square, nan=np.inf))
+        now = fits[_least(fits)]
         # Each side tells how the body turns. The one that predicts the other better is
         # used.
-        found = []
+        by_side = []
         for known, predicted in (gap.sides, gap.sides[::-1]):
             kept = best.kept.copy()
             kept[gap.trial] *= known
-            side = yield from _fitted_again(best, best.minimum.point, last, kept)
+            side = yield from _fitted_again(now, now.minimum.point, last, kept)
             if side.minimum.settled:
-                found.append(places_beside(side, best, gap.trial, predicted, noise))
-        if not found:
+                by_side.append(places_beside(side, now, gap.trial, predicted, noise))
+        if not by_side:
             complete = False
             continue
-        places = min(found, key=lambda x: x.angle)
+        places = min(by_side, key=lambda x: x.angle)
         complete = complete and places.complete
         squares = []
         for point in places.points:
@@ -576,22 +578,27 @@ def _among_counts(
             squares.append(float(there.square))
         for point in places.lowest(np.array(squares)):
             fits.append((yield from _fitted_again(best, point, last, best.kept)))
-    squares = np.array([float(x.minimum.square) for x in fits])
-    found = fits[int(np.nanargmin(squares))]
-    is_near = squares - found.minimum.square < _RIVAL * noise
-    near = [x for x, is_good in zip(fits, is_near, strict=True) if is_good]
+    least = fits[_least(fits)]
     # What the errors of the fit allow is no other minimum.
-    rival = any(_distance(found, x) > _BEYOND * np.sqrt(noise) for x in near)
-    return found, rival or not complete
+    is_rival = [
+        x.minimum.square - least.minimum.square < _RIVAL * noise
+        and _distance(least, x) > _BEYOND * np.sqrt(noise)
+        for x in fits
+    ]
+    return least, any(is_rival) or not complete
+
+
+def _least(fits: Sequence[Fit]) -> int:
+    """Index of the fit with the smallest sum of squares, of which one is finite."""
+    return int(np.nanargmin([x.minimum.square for x in fits]))
 
 
 def _distance(one: Fit, other: Fit) -> float:
     """How far apart the numbers of two fits are, in errors of the first for noise 1."""
     known = precision(one)
-    change = (
-        other.minimum.point.numbers - one.minimum.point.numbers
-    ) / one.minimum.units
-    return float(np.linalg.norm(known.values * (known.directions.T @ change)))
+    change = other.minimum.point.numbers - one.minimum.point.numbers
+    along = known.directions.T @ (change / one.minimum.units)
+    return float(np.linalg.norm(known.values * along))
 
 
 def _fitted_again(fit: Fit, point: Point, stage: Stage, kept: np.ndarray) -> Search:
