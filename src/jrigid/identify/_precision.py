@@ -18,8 +18,6 @@ from jrigid.identify._unknowns import Unknowns
 
 # Of the largest singular value: a change of the state that the record shows.
 SHOWN = 1e-9
-# Of the largest singular value: a direction that the record does not show.
-_HIDDEN = 1e-10
 # Of the change of the tensor: the part that changes moments where it only turns.
 _NO_CHANGE = 1e-5
 # Natural units that the error of a turn has if the record does not show it. A larger
@@ -171,10 +169,18 @@ def of_numbers(
     # The triangle has the singular values of all rows and is small.
     sound = np.all(np.isfinite(r))
     _, values, vt = np.linalg.svd(r if sound else np.zeros_like(r), full_matrices=False)
+    covariance = _covariance(values, vt.T, units if sound else np.nan * units)
+    return values, vt.T, covariance
+
+
+def _covariance(
+    values: np.ndarray, directions: np.ndarray, units: np.ndarray
+) -> np.ndarray:
+    """Covariance of the numbers, by `Precision.values` and its directions."""
     eps = np.finfo(units.dtype).eps
     floor = 16 * eps * np.max(values, initial=0.0) + least_value(units.dtype)
-    half = vt / np.maximum(values, floor)[:, None] * (units if sound else np.nan)
-    return values, vt.T, half.T @ half
+    half = units[:, None] * directions / np.maximum(values, floor)
+    return half @ half.T
 
 
 def least_value(dtype: np.dtype) -> float:
@@ -195,7 +201,9 @@ def precision(fit: Fit) -> Precision:
     """What a fit determines of the numbers."""
     units = fit.minimum.units
     found = precision_of(reduced(fit), units)
-    is_hidden = found.values < _HIDDEN * np.max(found.values, initial=0.0)
+    # Rounding leaves less than this of a direction that the record does not show.
+    rounding = np.finfo(found.values.dtype).eps ** (2 / 3)
+    is_hidden = found.values < rounding * np.max(found.values, initial=0.0)
     if not np.any(is_hidden):
         return found
     is_turn = turns_of(fit.problem.unknowns, fit.minimum.point.numbers)
@@ -206,9 +214,8 @@ def precision(fit: Fit) -> Precision:
         )
     ]
     values = np.array(bounded, found.values.dtype)
-    floor = 16 * np.finfo(values.dtype).eps * np.max(values) + least_value(values.dtype)
-    half = units[:, None] * found.directions / np.maximum(values, floor)
-    return found._replace(values=values, covariance=half @ half.T)
+    covariance = _covariance(values, found.directions, units)
+    return found._replace(values=values, covariance=covariance)
 
 
 def turns_of(unknowns: Unknowns, numbers: np.ndarray) -> Callable[[np.ndarray], bool]:
