@@ -1094,8 +1094,9 @@ def test_too_few_samples_and_wrong_options(untyped):
     with pytest.raises(ValueError, match="sigma"):
         identify.Rates(TS, np.ones((200, 3)), np.ones(7))
     star = identify.Directions(TS, np.ones((200, 3)), 0.01, of=np.ones(3))
+    momenta = identify.Record(identify.MomentumSensor(), TS, np.ones((200, 3)), 0.01)
     with pytest.raises(ValueError, match="attitude"):
-        identify.fit(BLIND, (readings, star))
+        identify.fit(BLIND, (readings, momenta))
     with pytest.raises(ValueError, match="start"):
         identify.fit(BLIND, star)
 
