@@ -1,7 +1,7 @@
 """Conditions that end a motion, and the time at which the first of them is met."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,6 @@ class Conditions(NamedTuple):
             The time, and the index of the condition that is zero there; -1 where it is
             a boolean, or jumps.
         """
-        t0, t1 = ends
         first, last = values
 
         def at(t: Array) -> Float[Array, " conditions"]:
@@ -82,19 +81,9 @@ class Conditions(NamedTuple):
         def changed(values: Array) -> Bool[Array, " conditions"]:
             return happened & (jnp.sign(values) == jnp.sign(last))
 
-        def halve(
-            _: Int[Array, ""], bracket: tuple[Array, Array]
-        ) -> tuple[Array, Array]:
-            low, high = bracket
-            middle = low + 0.5 * (high - low)
-            late = jnp.any(changed(at(middle)))
-            return jnp.where(late, low, middle), jnp.where(late, middle, high)
-
-        count = jnp.where(sought, _BISECTIONS[t0.dtype.itemsize], 0)
-        bracket = jax.lax.fori_loop(0, count, halve, (t0, t1))
-        # A condition has changed at the upper end of the bracket, and none at the
-        # lower.
-        exact = jax.lax.stop_gradient(bracket[1])
+        count = jnp.where(sought, halvings(ends[0].dtype), 0)
+        time = first_change(lambda t: jnp.any(changed(at(t))), ends, count)
+        exact = jax.lax.stop_gradient(time)
         found = at(exact)
         which = jnp.argmax(changed(found)).astype(jnp.int32)
         size = jnp.maximum(jnp.abs(first), jnp.abs(last))
@@ -102,3 +91,31 @@ class Conditions(NamedTuple):
         # motion will end with a state that is not finite.
         jumps = (jnp.abs(found) > _JUMP * size) | jnp.array(self.boolean)
         return exact, jnp.where(jumps[which], -1, which)
+
+
+def halvings(dtype: Any) -> int:
+    """How often a step is halved until rounding alone limits a time in it."""
+    return _BISECTIONS[jnp.dtype(dtype).itemsize]
+
+
+def first_change(
+    has_changed: Callable[[Array], Bool[Array, ""]],
+    ends: tuple[Array, Array],
+    count: int | Array,
+) -> Float[Array, ""]:
+    """The time from which on something has changed, by bisection.
+
+    Args:
+        has_changed: Whether it has at a time.
+        ends: Times before and after the change.
+        count: Number of halvings.
+    """
+
+    def halve(_: Int[Array, ""], bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        middle = low + 0.5 * (high - low)
+        late = has_changed(middle)
+        return jnp.where(late, low, middle), jnp.where(late, middle, high)
+
+    # It has changed at the upper end of the bracket, and not at the lower.
+    return jax.lax.fori_loop(0, count, halve, ends)[1]

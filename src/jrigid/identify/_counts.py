@@ -11,10 +11,10 @@ import numpy as np
 
 from jrigid._core.compile import small_program
 from jrigid.identify._independent import condensed_rows
+from jrigid.identify._minimise import moved_on_path
 from jrigid.identify._precision import precision, reduced
 from jrigid.identify._quality import Fit, signal_of, weights_of
-from jrigid.identify._smoother import Move, Point, moved
-from jrigid.identify._unknowns import Unknowns
+from jrigid.identify._smoother import Move, Point
 
 _GAP = 3.5  # radians that a body turns in a gap
 _LONG = 10.0  # times the median interval of its trial that a gap lasts
@@ -24,6 +24,7 @@ _FAR = 5.0  # standard errors to which other numbers of turns are looked for
 _STEP = 0.5  # radians between places to look at; minima are some six radians apart
 _MOST = 400  # places to look at beside one gap
 _SHOWN = 1e-7  # of the largest singular value: a direction that the record shows
+_point_after = small_program(moved_on_path)
 
 
 class Gap(NamedTuple):
@@ -179,10 +180,4 @@ def _point_moved(fit: Fit, trial: int, numbers: np.ndarray, local: np.ndarray) -
     states[trial, 0] = local[: states.shape[-1]]
     own[trial] = local[states.shape[-1] :]
     move = Move(numbers, own, states.astype(point.omega.dtype))
-    return _moved_by(fit.problem.unknowns, point, move)
-
-
-@small_program
-def _moved_by(unknowns: Unknowns, point: Point, move: Move) -> Point:
-    """A point after a change, on the path of the inertia model."""
-    return moved(point, move, unknowns.moved(point.numbers, move.numbers))
+    return _point_after(fit.problem.unknowns, point, move)

@@ -250,10 +250,9 @@ def _evaluate(
     return _Evaluation(point, rows, links, weight, kicks, square, square + kicks)
 
 
-def _moved(problem: Problem, point: Point, move: Move) -> Point:
+def moved_on_path(unknowns: Unknowns, point: Point, move: Move) -> Point:
     """Return a point after a move, on the path of the inertia model."""
-    numbers = problem.unknowns.moved(point.numbers, move.numbers)
-    return moved(point, move, numbers)
+    return moved(point, move, unknowns.moved(point.numbers, move.numbers))
 
 
 def _next_step(place: _Evaluation, push: Push, damping: Array) -> tuple[Move, Array]:
@@ -360,7 +359,7 @@ def _iteration(
     loop: _Loop,
 ) -> _Loop:
     """Try the step, keep the better point and compute the next step, in all lanes."""
-    point = over_lanes(_moved)(problem, loop.best.point, loop.move)
+    point = over_lanes(moved_on_path)(problem.unknowns, loop.best.point, loop.move)
     new = over_lanes(_evaluate)(problem, layout, settings, push, point)
     # Residuals are not finite where the motion could not be integrated.
     finite = jnp.all(jnp.isfinite(new.rows.of_border), axis=(1, 2, 3, 4))

@@ -16,7 +16,12 @@ from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments,
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
-from jrigid.identify._sensors import AttitudeSensor, Gyro, Magnetometer
+from jrigid.identify._sensors import (
+    AbstractSensor,
+    AttitudeSensor,
+    Gyro,
+    Magnetometer,
+)
 
 # I3/I1: degrees for radians shrink the gaps of the moments by a factor of 57.
 _NEARLY_A_SPHERE = 1.03
@@ -110,6 +115,18 @@ def _reason(result: FitResult) -> str:
     )
 
 
+def _readings_of(result: FitResult) -> list[tuple[AbstractSensor, np.ndarray]]:
+    """Each sensor as it was found, and the values that were seen (n, width)."""
+    samples = result.problem.samples
+    is_seen = np.asarray(samples.seen)
+    return [
+        (sensor, np.asarray(values)[is_seen[:, part]])
+        for sensor, values, part in zip(
+            result.fitted()[1:], samples.values, samples.parts, strict=True
+        )
+    ]
+
+
 def _of_clocks(result: FitResult) -> str:
     """A sentence about records of one motion that have no time in common."""
     samples = result.problem.samples
@@ -131,15 +148,11 @@ def _of_clocks(result: FitResult) -> str:
 
 def _of_field(result: FitResult) -> str:
     """A sentence about a magnetometer whose field has another size than the readings."""
-    samples = result.problem.samples
     is_biased = any("magnetometer.bias" in x.name for x in result.unknowns.sought)
-    for sensor, values, part in zip(
-        result.fitted()[1:], samples.values, samples.parts, strict=True
-    ):
+    for sensor, values in _readings_of(result):
         if not isinstance(sensor, Magnetometer) or is_biased:
             continue
-        is_seen = np.asarray(samples.seen)[:, part]
-        read = np.median(np.linalg.norm(np.asarray(values)[is_seen], axis=-1))
+        read = np.median(np.linalg.norm(values, axis=-1))
         size = np.linalg.norm(np.asarray(sensor.field))
         if not 1 / _OTHER_FIELD < read / max(size, 1e-300) < _OTHER_FIELD:
             return (
@@ -207,16 +220,10 @@ def _of_gyro(result: FitResult) -> str:
 
 def _of_limit(result: FitResult) -> str:
     """The limit at which readings of a gyro stand, or an empty text without one."""
-    for sensor, values, part in zip(
-        result.fitted()[1:],
-        result.problem.samples.values,
-        result.problem.samples.parts,
-        strict=True,
-    ):
+    for sensor, values in _readings_of(result):
         if not isinstance(sensor, Gyro) or sensor.saturation() is not None:
             continue
-        is_seen = np.asarray(result.problem.samples.seen)[:, part]
-        for sizes in np.abs(np.asarray(values)[is_seen]).T:
+        for sizes in np.abs(values).T:
             # An axis that reads nothing says nothing.
             levels, counts = np.unique(np.append(sizes, 0.0), return_counts=True)
             at_next, at_last = np.append(0, counts)[-2:]

@@ -557,7 +557,7 @@ def _among_counts(
     fits = [best]
     complete = True
     for gap in gaps_of(best):
-        now = fits[_least(fits)]
+        now = _lowest(fits)
         # Each side tells how the body turns. The one that predicts the other better is
         # used.
         by_side = []
@@ -578,7 +578,7 @@ def _among_counts(
             squares.append(float(there.square))
         for point in places.lowest(np.array(squares)):
             fits.append((yield from _fitted_again(best, point, last, best.kept)))
-    least = fits[_least(fits)]
+    least = _lowest(fits)
     # What the errors of the fit allow is no other minimum.
     is_rival = [
         x.minimum.square - least.minimum.square < _RIVAL * noise
@@ -588,9 +588,9 @@ def _among_counts(
     return least, any(is_rival) or not complete
 
 
-def _least(fits: Sequence[Fit]) -> int:
-    """Index of the fit with the smallest sum of squares, of which one is finite."""
-    return int(np.nanargmin([x.minimum.square for x in fits]))
+def _lowest(fits: Sequence[Fit]) -> Fit:
+    """The fit with the smallest sum of squares, of which one is finite."""
+    return fits[int(np.nanargmin([x.minimum.square for x in fits]))]
 
 
 def _distance(one: Fit, other: Fit) -> float:

@@ -5,7 +5,7 @@ Only documented parts of diffrax are used: terms, controllers, `diffeqsolve`.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -17,6 +17,7 @@ from jaxtyping import Array, PyTree
 
 from jrigid._checks import all_finite
 from jrigid._stepping.control import Limits, in_tolerances, judge
+from jrigid._stepping.events import first_change, halvings
 from jrigid._stepping.motion import Motion, constant, fastest_rate, first_direction
 from jrigid._stepping.scales import jacobian, rate_along, undamped_rate
 from jrigid._stepping.steppers import Field
@@ -120,49 +121,20 @@ class RateController(diffrax.AbstractAdaptiveStepSizeController):
         return rate_along(field, y, field(y), direction, self.scales)
 
 
-class _Bracket(NamedTuple):
-    """Times between which a condition changes its sign.
-
-    Attributes:
-        low: Before the change.
-        high: At the change, or after it.
-        signs: Of the conditions at the end of the step.
-        changing: Which of them have another sign at its start.
-    """
-
-    low: Array
-    high: Array
-    signs: Array
-    changing: Array
-
-
 class _FirstChange(optx.AbstractRootFinder):
     """The first time in a step at which a condition has the sign that it ends with.
 
     Optimistix's bisection takes a single condition, and none that is zero at the start.
+    This is the bisection of our own loop, whose state is whether it is done.
     """
 
-    rtol: float
-    atol: float
+    rtol: ClassVar[float] = 0.0
+    atol: ClassVar[float] = 0.0
     norm: ClassVar[Callable[[PyTree], Array]] = optx.max_norm
 
-    def init(
-        self,
-        fn: Callable[..., Any],
-        y: Array,
-        args: PyTree,
-        options: dict[str, Any],
-        f_struct: PyTree,
-        aux_struct: PyTree,
-        tags: frozenset[object],
-    ) -> _Bracket:
-        """The step as a whole."""
-        del f_struct, aux_struct, tags
-        low = jnp.asarray(options["lower"], y.dtype)
-        high = jnp.asarray(options["upper"], y.dtype)
-        signs = _signs(fn, high, args)
-        # diffrax puts zero in place of conditions that did not end the step.
-        return _Bracket(low, high, signs, _signs(fn, low, args) != signs)
+    def init(self, *_: Any) -> Array:
+        """Not done."""
+        return jnp.array(False)
 
     def step(
         self,
@@ -170,17 +142,24 @@ class _FirstChange(optx.AbstractRootFinder):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _Bracket,
-        tags: frozenset[object],
-    ) -> tuple[Array, _Bracket, PyTree]:
-        """Halve the bracket."""
-        del y, options, tags
-        middle = state.low + 0.5 * (state.high - state.low)
-        values, aux = fn(middle, args)
-        late = jnp.any(state.changing & (_signs_of(values) == state.signs))
-        low = jnp.where(late, state.low, middle)
-        high = jnp.where(late, middle, state.high)
-        return high, state._replace(low=low, high=high), aux
+        *_: Any,
+    ) -> tuple[Array, Array, PyTree]:
+        """Find the time."""
+
+        def signs(t: Array) -> Array:
+            return jnp.sign(jnp.stack(jtu.tree_leaves(fn(t, args)[0])))
+
+        low = jnp.asarray(options["lower"], y.dtype)
+        high = jnp.asarray(options["upper"], y.dtype)
+        last = signs(high)
+        # diffrax puts zero in place of conditions that did not end the step.
+        changing = signs(low) != last
+
+        def has_changed(t: Array) -> Array:
+            return jnp.any(changing & (signs(t) == last))
+
+        time = first_change(has_changed, (low, high), halvings(y.dtype))
+        return time, jnp.array(True), fn(time, args)[1]
 
     def terminate(
         self,
@@ -188,38 +167,19 @@ class _FirstChange(optx.AbstractRootFinder):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _Bracket,
+        state: Array,
         tags: frozenset[object],
     ) -> tuple[Array, optx.RESULTS]:
-        """Whether the bracket is short enough."""
+        """Whether it is done."""
         del fn, y, args, options, tags
-        size = self.atol + self.rtol * jnp.abs(state.high)
-        return state.high - state.low <= size, optx.RESULTS.successful
+        return state, optx.RESULTS.successful
 
     def postprocess(
-        self,
-        fn: Callable[..., Any],
-        y: Array,
-        aux: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: _Bracket,
-        tags: frozenset[object],
-        result: optx.RESULTS,
+        self, fn: Callable[..., Any], y: Array, aux: PyTree, *_: Any
     ) -> tuple[Array, PyTree, dict[str, Any]]:
         """The time, as it is."""
-        del fn, args, options, state, tags, result
+        del fn
         return y, aux, {}
-
-
-def _signs(fn: Callable[..., Any], t: Array, args: PyTree) -> Array:
-    """Signs of all conditions at a time."""
-    return _signs_of(fn(t, args)[0])
-
-
-def _signs_of(values: PyTree) -> Array:
-    """Signs of the values of conditions."""
-    return jnp.sign(jnp.stack(jtu.tree_leaves(values)))
 
 
 def solve_by_diffrax(
@@ -245,7 +205,7 @@ def solve_by_diffrax(
     fixed = constant(motion)
     limits = fixed.limits
     if event is not None and event.root_finder is None:
-        finder = _FirstChange(_exactness(limits), _exactness(limits))
+        finder = _FirstChange()
         event = dataclasses.replace(event, root_finder=finder)
     solution = diffrax.diffeqsolve(
         _terms(field, fixed, options),
@@ -308,11 +268,6 @@ def _terms(field: Field, fixed: Motion, options: Options) -> diffrax.ODETerm:
         return diffrax.ODETerm(vector_field)
     # A rate that is not finite would reach the derivatives of other lanes.
     return diffrax.ODETerm(jtu.Partial(_guarded, fixed.y0, field))
-
-
-def _exactness(limits: Limits) -> float:
-    """Tolerance of the time of an event."""
-    return 16 * float(jnp.finfo(limits.end.dtype).eps)
 
 
 def _guarded(
