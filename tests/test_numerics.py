@@ -8,9 +8,12 @@ from helpers import DTYPES, ulps
 from jrigid._numerics import (
     arctanc_sqrt,
     cos_sqrt,
+    inverse_of_power,
+    power_of_two,
     safe_arctan2,
     safe_norm,
     sinc_sqrt,
+    unit_again,
 )
 
 
@@ -48,6 +51,47 @@ def test_norm_neither_overflows_nor_underflows_and_nor_does_its_gradient(dtype):
         np.testing.assert_allclose(
             gradient, np.array([2, -3, 6]) / 7, rtol=ulps(dtype, 4)
         )
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_inverses_of_powers_of_two_are_exact_where_they_are_normal_numbers(dtype):
+    info = np.finfo(dtype)
+    # The inverse of the smallest normal number is normal, that of the largest is not.
+    powers = np.ldexp(dtype(1), np.arange(info.minexp, info.maxexp - 1)).astype(dtype)
+    assert powers[0] == info.tiny
+    inverses = inverse_of_power(jnp.asarray(powers))
+    assert inverses.dtype == dtype
+    np.testing.assert_array_equal(inverses, dtype(1) / powers)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_every_number_has_a_power_of_two_next_to_it_with_a_normal_inverse(dtype):
+    info = np.finfo(dtype)
+    tiny, huge = float(info.tiny), float(info.max)
+    sizes = [0.0, tiny / 4, tiny, 0.75, 1.0, -3.0, huge, np.inf, np.nan]
+    powers = power_of_two(jnp.asarray(sizes, dtype))
+    np.testing.assert_array_equal(powers[3:6], np.array([1.0, 2.0, 4.0], dtype))
+    assert powers[0] == 1
+    inverses = np.asarray(inverse_of_power(powers))
+    assert np.all((inverses >= info.tiny) & (inverses < np.inf))
+    np.testing.assert_array_equal(inverses * np.asarray(powers), 1)
+
+
+def test_a_vector_of_norm_nearly_one_is_brought_to_one_with_derivatives():
+    unit = np.array([2.0, -3.0, 6.0]) / 7
+    np.testing.assert_allclose(unit_again(jnp.asarray(1.001 * unit)), unit, rtol=4e-16)
+
+    # Of v / |v| at a unit vector u: P and -(u P + P u + P u) with P = 1 - u u.
+    across = np.eye(3) - np.outer(unit, unit)
+    first = jax.jacfwd(unit_again)(jnp.asarray(unit))
+    np.testing.assert_allclose(first, across, atol=1e-15)
+    second = jax.hessian(unit_again)(jnp.asarray(unit))
+    expected = -(
+        np.einsum("i,jk->ijk", unit, across)
+        + np.einsum("j,ik->ijk", unit, across)
+        + np.einsum("k,ij->ijk", unit, across)
+    )
+    np.testing.assert_allclose(second, expected, atol=1e-14)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

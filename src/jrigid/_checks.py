@@ -537,6 +537,14 @@ class Findings:
         self._messages.append(str(RESULTS[code] if message is None else message))
         self._values.append(value)
 
+    def compute_once(self) -> None:
+        """Reduce the conditions to one value, which all later kernels read.
+
+        XLA's CPU compiler would compute a chain of conditions anew in each kernel that
+        depends on it. It does not repeat a square root.
+        """
+        self.ok = jnp.sqrt(jnp.where(self.ok, np.float32(1), np.float32(0))) > 0
+
     def guard(self, tree: Tree, throw: bool) -> Tree:
         """Return the result of a builder; raise, or return NaN, for invalid input."""
         check_known("throw", throw)

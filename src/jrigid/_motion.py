@@ -30,10 +30,9 @@ from jrigid._checks import (
 )
 from jrigid._core.compile import quick_jit
 from jrigid._core.third_party import used_inputs
-from jrigid._numerics import safe_norm
+from jrigid._numerics import safe_norm, unit_again
 from jrigid._types import BodyState
 from jrigid.dynamics import ExactStates, State
-from jrigid.rotation import normalize
 from jrigid.systems import AbstractSystem, RigidBody
 
 Motion = TypeVar("Motion", bound=Any)
@@ -222,7 +221,8 @@ def harmless_motion(ok: Array, motion: Motion) -> Motion:
         motion: A named tuple with a field `state0`.
     """
     motion = harmless(ok, motion)
-    attitude = normalize(motion.state0.attitude)
+    # Of a valid motion the norm is 1 but for rounding.
+    attitude = unit_again(motion.state0.attitude)
     return motion._replace(state0=dataclasses.replace(motion.state0, attitude=attitude))
 
 

@@ -31,7 +31,13 @@ def safe_norm(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
     """Euclidean norm without overflow; value and gradient are 0 at the zero vector."""
     # Squares of the quotients stay in range. A power of two adds no rounding.
     scale = power_of_two(_over_components(jnp.maximum, jnp.abs(vector)))
-    return scale * root_of_positive(sum_of_squares(vector * (1 / scale)[..., None]))
+    unit = vector * inverse_of_power(scale)[..., None]
+    return scale * root_of_positive(sum_of_squares(unit))
+
+
+def unit_again(vector: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A vector whose norm is nearly 1, brought to 1."""
+    return vector * jax.lax.rsqrt(sum_of_squares(vector))
 
 
 def sum_of_squares(vector: Float[Array, "*many n"]) -> Float[Array, "*many"]:
@@ -171,6 +177,19 @@ def power_of_two(x: Float[Array, "..."]) -> Float[Array, "..."]:
     )
     # A scale is piecewise constant, and cancels where it is used.
     return jax.lax.stop_gradient(jnp.where(x == 0, 1.0, power))
+
+
+def inverse_of_power(power: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The inverse of a power of two, exactly, if it is a normal number.
+
+    In the bits of the exponent: XLA's CPU compiler makes a kernel of its own for a
+    division whose result several kernels need.
+    """
+    info = jnp.finfo(power.dtype)
+    integer = jnp.dtype(f"int{info.bits}")
+    one = int(np.ones((), power.dtype).view(integer))
+    bits = 2 * one - jax.lax.bitcast_convert_type(power, integer)
+    return jax.lax.stop_gradient(jax.lax.bitcast_convert_type(bits, power.dtype))
 
 
 def gauss_legendre(count: int, dtype: Any) -> tuple[Array, Array]:

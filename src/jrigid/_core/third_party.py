@@ -311,8 +311,12 @@ def slice_with_last_axis(equation: core.JaxprEqn, size: int, *values: Any) -> An
     starts = [*values[arrays:], jax.numpy.zeros_like(values[-1])]
     if arrays == 1:
         sizes = (*equation.params["slice_sizes"], size)
-        return jax.lax.dynamic_slice(values[0], starts, sizes)
-    return jax.lax.dynamic_update_slice(values[0], values[1], starts)
+        return jax.lax.dynamic_slice(
+            values[0], starts, sizes, allow_negative_indices=False
+        )
+    return jax.lax.dynamic_update_slice(
+        values[0], values[1], starts, allow_negative_indices=False
+    )
 
 
 def called_program(

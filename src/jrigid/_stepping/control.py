@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jrigid._numerics import inverse_of_power
+
 # Bounds of a step in radians of the fastest rate, which is that of the turning or of
 # the linearised motion. At an equilibrium the error estimate is zero: a step that is
 # too long leaves the value right and the derivative wrong. Between these bounds the
@@ -87,24 +89,33 @@ class Verdict(NamedTuple):
     rate: Float[Array, ""]
 
 
-def largest_steps(order: int, rtol: Float[Array, ""]) -> Float[Array, "2"]:
+def largest_steps(
+    order: int, rtol: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Longest step of a method of this order, in radians of the fastest rate.
 
     The second number holds where derivatives are taken.
     """
     # A method of this order omits the term x^(order + 1) / (order + 1)! of a step of x
     # radians. This is x^order / (order + 1)! for each radian.
-    error = math.factorial(order + 1) * rtol * jnp.array(_TOLERANCES, rtol.dtype)
-    largest = jnp.array(_LARGEST_BOUNDS, rtol.dtype)
-    return jnp.clip(error ** (1 / order), SMALLEST_BOUND, largest)
+    for_values, for_derivatives = (
+        jnp.clip(
+            (math.factorial(order + 1) * tolerances * rtol) ** (1 / order),
+            SMALLEST_BOUND,
+            largest,
+        )
+        for tolerances, largest in zip(_TOLERANCES, _LARGEST_BOUNDS, strict=True)
+    )
+    return for_values, for_derivatives
 
 
 def in_tolerances(
     limits: Limits, scales: Array, y0: Array, y1: Array, error: Array
 ) -> Float[Array, ""]:
     """Root mean square of an error's components, each divided by its tolerance."""
-    size = jnp.maximum(jnp.abs(y0 / scales), jnp.abs(y1 / scales))
-    multiples = (error / scales) / (limits.atol + size * limits.rtol)
+    inverse = inverse_of_power(scales)
+    size = jnp.maximum(jnp.abs(y0), jnp.abs(y1)) * inverse
+    multiples = (error * inverse) / (limits.atol + size * limits.rtol)
     norm = jnp.sqrt(jnp.mean(multiples * multiples))
     # An infinite error shrinks the next step as far as is allowed. NaN would become the
     # length of that step.

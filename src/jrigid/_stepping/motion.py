@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jrigid._numerics import inverse_of_power
 from jrigid._stepping.control import Limits
 
 Tree = TypeVar("Tree")
@@ -98,14 +99,14 @@ def fastest_rate(scales: Array, omega: int, y: Array, other: Array) -> Array:
     """The rate that bounds the steps: that of turning, or `other` if it is faster.
 
     Args:
-        scales: Of the components of the state.
+        scales: Of the components of the state; powers of two.
         omega: Where in the state the angular velocity starts.
         y: The state.
         other: Rate of the linearised motion.
     """
     # Scaled, since the squares of rates may be out of the range of the dtype.
-    unit = scales[omega]
-    turning = unit * jnp.sqrt(jnp.sum((y[omega : omega + 3] / unit) ** 2))
+    scaled = (y * inverse_of_power(scales))[omega : omega + 3]
+    turning = scales[omega] * jnp.sqrt(jnp.sum(scaled * scaled))
     rate = jnp.maximum(other, turning)
     # Lengths of steps are angles divided by this rate, so it must not be zero.
     tiny = jnp.finfo(rate.dtype).tiny

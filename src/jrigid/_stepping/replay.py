@@ -19,7 +19,7 @@ from jrigid._core.lanes import some_at_a_time
 from jrigid._core.lanes_last import lanes_last
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import Motion, Progress
-from jrigid._stepping.step import apart
+from jrigid._stepping.step import apart, put
 
 Tree = TypeVar("Tree")
 
@@ -292,10 +292,10 @@ def _without_later(checkpoints: _Checkpoints, attempt: Array) -> _Checkpoints:
 
 
 def _put(buffers: Tree, entries: Tree, index: Array) -> Tree:
-    """Store an entry in each of the arrays of a pytree, along the first axis."""
+    """Store an entry in each of the arrays of a pytree."""
 
     def stored(buffer: Array, entry: Array) -> Array:
-        return jax.lax.dynamic_update_index_in_dim(buffer, entry, index, 0)
+        return put(buffer, entry, index)
 
     return jtu.tree_map(stored, buffers, entries)
 

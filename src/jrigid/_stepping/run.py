@@ -21,6 +21,7 @@ from jrigid._core.lanes import width_of
 from jrigid._core.lanes_last import lanes_last
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import EMPTY, Motion, Progress, steps_fixed
+from jrigid._stepping.step import put
 
 # Largest number of steps between two searches for finished lanes. A larger number
 # saves searches, but finished lanes are idle for longer.
@@ -63,7 +64,7 @@ def run_alone(engine: Engine, motion: Motion) -> Ends:
         progress, saved = carry
         progress, _, _, output = engine.attempt(motion, progress)
         # The row after the last output time is never read.
-        saved = jax.lax.dynamic_update_index_in_dim(saved, progress.y, output, 0)
+        saved = put(saved, progress.y, output)
         return progress, saved
 
     start = (engine.begin(motion), _states_at_start(motion))

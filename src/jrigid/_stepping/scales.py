@@ -1,6 +1,7 @@
 """Scales of a motion: its fastest rate, and one for each component of its state."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
 from jrigid._checks import internal_parts
-from jrigid._numerics import power_of_two, safe_norm
+from jrigid._numerics import inverse_of_power, power_of_two, safe_norm
 from jrigid._types import BodyState
 from jrigid.systems import AbstractSystem, FloatingState
 
@@ -27,14 +28,29 @@ def jacobian(
 
     Differences need no derivative rules of a user's function. Each row belongs to a
     component of the state.
+
+    Args:
+        field: The vector field, of the state.
+        y: The state.
+        scales: Of the components; powers of two.
     """
-    largest = jnp.maximum(1.0, jnp.abs(y / scales))
-    # This step balances the rounding and the truncation error of a forward difference.
-    step = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest
+    largest = jnp.maximum(1.0, jnp.abs(y * inverse_of_power(scales)))
+    step = _step_of_difference(largest)
     # The first row is zero: the state itself.
     which = np.eye(y.size + 1, y.size, k=-1, dtype=y.dtype)
     rates = jax.vmap(lambda row: field(y + row * step * scales))(which)
-    return (rates[1:] - rates[:1]) / (step[:, None] * scales[None])
+    inverse = inverse_of_power(step)[:, None] * inverse_of_power(scales)[None]
+    return (rates[1:] - rates[:1]) * inverse
+
+
+def _step_of_difference(largest: Array) -> Array:
+    """The step of a forward difference, from the largest component of the state.
+
+    It balances the error of rounding and that of truncation, and is a power of two.
+    """
+    half = 0.5 * math.sqrt(jnp.finfo(largest.dtype).eps) * largest
+    # The next power of two above half of a number is at most that number.
+    return power_of_two(half)
 
 
 def rate_along(
@@ -55,11 +71,10 @@ def rate_along(
         y: The state.
         base: Value of the field at that state.
         direction: Of the displacement, of length 1 in the scales.
-        scales: Of the components.
+        scales: Of the components; powers of two.
     """
-    largest = jnp.maximum(1.0, jnp.max(jnp.abs(y / scales)))
-    # The step of a forward difference, as in `jacobian`.
-    nudge = jnp.sqrt(jnp.finfo(y.dtype).eps) * largest * scales
+    largest = jnp.maximum(1.0, jnp.max(jnp.abs(y * inverse_of_power(scales))))
+    nudge = _step_of_difference(largest) * scales
 
     def change(_: Int[Array, ""], carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rate, direction = carry
@@ -84,8 +99,8 @@ def spectral_radius(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
         matrix, log_factor = carry
         largest = jnp.max(jnp.abs(matrix))
         # Without the scale the high power of a matrix could overflow.
-        scale = jnp.where(largest > 0, largest, 1.0)
-        matrix = matrix / scale
+        scale = power_of_two(largest)
+        matrix = matrix * inverse_of_power(scale)
         matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
         return matrix, 2.0 * (log_factor + jnp.log(scale))
 
@@ -115,6 +130,7 @@ def spread(
     rate: Array,
     length: Array | None = None,
     speed: Array | None = None,
+    rounded: Callable[[Array], Array] = lambda scale: scale,
 ) -> Array:
     """A scale for each component of the state of a body that turns at a rate.
 
@@ -126,6 +142,7 @@ def spread(
         rate: Of turning [rad/s].
         length: Scale of the position of a body in flight [m].
         speed: Scale of its velocity [m/s].
+        rounded: Applied to each scale.
     """
     of_parts = internal_parts(system.torque.internal_scale(rate))
     have = jtu.tree_structure(of_parts)
@@ -143,8 +160,12 @@ def spread(
         "omega": rate,
         "internal": of_parts,
     }
+
+    def filled(value: Array, scale: Array) -> Array:
+        return jnp.full_like(value, rounded(scale))
+
     full = {
-        name: jtu.tree_map(jnp.full_like, value, scale[name])
+        name: jtu.tree_map(filled, value, scale[name])
         for name, value in vars(state).items()
     }
     return ravel_pytree(dataclasses.replace(state, **full))[0]
@@ -171,9 +192,8 @@ class _Start(NamedTuple):
 
     def powers(self, length: Array, speed: Array) -> Array:
         """Scales of the components of the state, as powers of two."""
-        scales = spread(self.system, self.state, self.rate, length, speed)
-        # Divisions by powers of two do not round.
-        return power_of_two(scales)
+        # Products with powers of two do not round.
+        return spread(self.system, self.state, self.rate, length, speed, power_of_two)
 
     def fastest(self, scales: Array) -> Array:
         """The fastest rate of the linearised motion, at least that of turning."""
@@ -205,8 +225,8 @@ def units(
     """
     rates: Any = system.vector_field(t0, state0, args)
     span = jnp.where(duration > 0, duration, 1.0)
-    turning, spinning_up = safe_norm(jnp.stack([state0.omega, rates.omega]))
-    rate = jnp.maximum(turning, jnp.sqrt(spinning_up))
+    turning = safe_norm(state0.omega)
+    rate = jnp.maximum(turning, jnp.sqrt(safe_norm(rates.omega)))
     rate = jnp.where(rate > 0, rate, 1 / span)
     start = _Start(system, state0, t0, args, rate, fastest_of)
     if isinstance(state0, FloatingState):

@@ -128,7 +128,17 @@ def _sum(weights: Sequence[AnyArray], rates: list[Array]) -> Array:
 
 def _row(table: np.ndarray, row: Array, dtype: np.dtype) -> Array:
     """A row of a table of constants."""
-    return jax.lax.dynamic_index_in_dim(jnp.asarray(table, dtype), row, keepdims=False)
+    return jax.lax.dynamic_index_in_dim(
+        jnp.asarray(table, dtype), row, keepdims=False, allow_negative_indices=False
+    )
+
+
+def put(table: Array, entry: Array, row: Array) -> Array:
+    """The table with an entry in a row, whose index is not negative."""
+    # Indices from the end would cost a kernel.
+    return jax.lax.dynamic_update_index_in_dim(
+        table, entry, row, 0, allow_negative_indices=False
+    )
 
 
 def apart(function: Callable[..., Any], true: Array, *arguments: Any) -> Any:
@@ -220,7 +230,7 @@ def _loop(
         rates, place = carry
         at = t + _row(method.times, i, y.dtype) * h
         rate = field(at, place) if joined else apart(field, i >= 0, at, place)
-        rates = jax.lax.dynamic_update_index_in_dim(rates, rate, i, 0)
+        rates = put(rates, rate, i)
         return rates, sums.then(place_of, i, (rates,), h, y)
 
     # Outside of lanes a sum includes the stages to come, with coefficients of zero.
@@ -316,7 +326,7 @@ def pull_back(
         of_stage = (weighted, t + _row(method.times, i, y.dtype) * h, place)
         # The reverse of a field is never short (see `_loop`).
         of_parameters, of_place = apart(of_rate, k >= 0, *of_stage)
-        cotangents = jax.lax.dynamic_update_index_in_dim(cotangents, of_place, i, 0)
+        cotangents = put(cotangents, of_place, i)
         return cotangents, jtu.tree_map(jnp.add, total, of_parameters)
 
     cotangents = jnp.zeros_like(rates).at[last].set(change)

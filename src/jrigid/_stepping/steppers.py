@@ -162,7 +162,7 @@ class ErrorControlled(NamedTuple):
         def step_to(h: Array, y: Array) -> tuple[Array, ...]:
             rates, y1 = stages(self.method, rates_at, t, h, y, in_lanes)
             # The fastest rate is found from the rate at the end alone.
-            returned = rates if keeps_rates else rates[-1:]
+            returned = rates if keeps_rates else rates[-1]
             return y1, error_of(self.method, rates, h), returned
 
         h = t1 - t
@@ -171,6 +171,7 @@ class ErrorControlled(NamedTuple):
         else:
             # A number of steps is never negative, so that the branch is always taken.
             y1, estimate, rates = apart(step_to, counts[1] >= 0, h, y)
+        rates = rates.reshape(-1, y.size)
         # The choice of steps is not differentiated.
         before, after, estimate, base = jax.lax.stop_gradient(
             (y, y1, estimate, rates[-1])

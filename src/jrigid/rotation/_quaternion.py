@@ -29,7 +29,8 @@ from jrigid._types import (
 def _scale(vector: Array) -> Array:
     """Power of two that brings the sum of the magnitudes of a vector to [1, 2)."""
     # Component by component: a reduction would not fuse with what follows.
-    return 2 / power_of_two(functools.reduce(jnp.add, [jnp.abs(x) for x in vector]))
+    size = functools.reduce(jnp.add, [jnp.abs(x) for x in vector])
+    return 2 / power_of_two(size)
 
 
 def rescaled(vector: Array) -> Array:

@@ -110,6 +110,7 @@ def judged(inputs: Inputs, options: Options) -> tuple[Findings, Limits, Array]:
     limits = limits_of(since_start[-1], fastest, options)
     if options.is_worth_foreseeing:
         require_enough_steps(findings, _can_be_enough(limits, options), limits)
+    findings.compute_once()
     return findings, limits, scales
 
 

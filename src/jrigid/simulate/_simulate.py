@@ -14,9 +14,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 from jaxtyping import ArrayLike as _ArrayLike
 
-from jrigid._checks import RESULTS, Findings, all_finite, harmless, nan_where, settle
+from jrigid._checks import (
+    RESULTS,
+    Findings,
+    all_finite,
+    harmless,
+    nan_where,
+    settle,
+)
 from jrigid._core.compile import floats_as_arrays, quick_jit
 from jrigid._motion import HasRigidBody, motion_arguments
+from jrigid._numerics import unit_again
 from jrigid._stepping.derivatives import (
     moved_by,
     moved_in_a_step,
@@ -39,7 +47,6 @@ from jrigid._stepping.motion import (
 from jrigid._stepping.run import Ends
 from jrigid._stepping.steppers import ErrorControlled
 from jrigid._types import BodyState, Real, ScalarLike
-from jrigid.rotation import normalize
 from jrigid.simulate._equal_steps import equal_steps
 from jrigid.simulate._event import (
     Condition,
@@ -227,10 +234,10 @@ class _Solved(NamedTuple):
     """The result of an integration, with times since the start.
 
     Attributes:
-        ys: States at the output times, as arrays.
-        reached: Which of the output times the motion reached.
+        ys: States at the output times, as arrays. If an event may end the motion, the
+            state at its end follows in a row of its own.
+        reached: Which of these states the motion reached.
         t: Time at which the motion ended.
-        y: State at that time.
         result: Result code.
         tried: Number of steps that were tried.
         accepted: Number of steps that were accepted.
@@ -239,7 +246,6 @@ class _Solved(NamedTuple):
     ys: Array
     reached: Array
     t: Array
-    y: Array
     result: Any
     tried: Array
     accepted: Array
@@ -290,9 +296,9 @@ def _closed_form(given: Prepared) -> _Solved:
 
     ys = jax.vmap(state_at)(motion.times)
     one = jnp.ones((), jnp.int32)
-    reached = jnp.ones(motion.times.shape, bool)
-    t, y = motion.times[-1], ys[-1]
-    return _Solved(ys, reached, t, y, RESULTS.successful, one, one)
+    reached = jnp.full(motion.times.shape, given.findings.ok)
+    end = motion.times[-1]
+    return _Solved(ys, reached, end, RESULTS.successful, one, one)
 
 
 def _by_diffrax(given: Prepared, options: Options) -> _Solved:
@@ -311,11 +317,26 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
     complete = (result == RESULTS.successful) & (event is None)
     t = jnp.where(complete, motion.times[-1], t)
     ys = _with_derivatives_in_times(given, options, motion.times, ys, t)
-    y = jnp.where(complete, ys[-1], y)
-    reached = jax.lax.stop_gradient(motion.times) <= jax.lax.stop_gradient(t)
+    reached = _reached(given, t)
+    if event is not None:
+        ys, reached = _with_end(ys, reached, y, result)
     tried = jnp.asarray(stats["num_steps"], jnp.int32)
     accepted = jnp.asarray(stats["num_accepted_steps"], jnp.int32)
-    return _Solved(ys, reached, t, y, result, tried, accepted)
+    return _Solved(ys, reached, t, result, tried, accepted)
+
+
+def _reached(given: Prepared, end: Array) -> Array:
+    """Which output times a motion reached that ended at a time."""
+    times = jax.lax.stop_gradient(given.times)
+    return (times <= jax.lax.stop_gradient(end)) & given.findings.ok
+
+
+def _with_end(
+    ys: Array, reached: Array, y: Array, result: RESULTS
+) -> tuple[Array, Array]:
+    """States and whether they were reached, with those of the end in a last row."""
+    good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+    return jnp.concatenate([ys, y[None]]), jnp.append(reached, good)
 
 
 def _event_of_arrays(
@@ -354,25 +375,26 @@ def _integrated(
             parameters=harmless(given.findings.ok, motion.parameters)
         )
     ends = solve(engine, motion)
+    times = given.times
     ys = ends.ys
+    result = _result_of(ends.counts[0])
     if conditions is None:
         # The last output has derivatives in its time, which the end of the loop has
         # not. But for rounding they are the same.
         complete = ends.counts[0] == ENDED
-        t = jnp.where(complete, given.times[-1], jax.lax.stop_gradient(ends.t))
-        ys = _with_derivatives_in_times(given, options, given.times, ys, t)
-        y = jnp.where(complete, ys[-1], ends.y)
+        t = jnp.where(complete, times[-1], jax.lax.stop_gradient(ends.t))
+        ys = _with_derivatives_in_times(given, options, times, ys, t)
+        reached = _reached(given, t)
     else:
         t, y = _end_at_event(given, options, conditions, motion, ends)
         # Output times within rounding of the event, or several at it, have no state of
         # their own.
-        number = jnp.arange(given.times.size, dtype=ends.counts.dtype)
-        missing = (number >= ends.counts[3]) & (given.times <= t)
+        number = jnp.arange(times.size, dtype=ends.counts.dtype)
+        missing = (number >= ends.counts[3]) & (times <= t)
         ys = jnp.where(missing[:, None], ends.y[None], ys)
-        ys = _with_derivatives_in_times(given, options, given.times, ys, t)
-    reached = jax.lax.stop_gradient(given.times) <= jax.lax.stop_gradient(t)
-    result = _result_of(ends.counts[0])
-    return _Solved(ys, reached, t, y, result, ends.counts[1], ends.counts[2])
+        ys = _with_derivatives_in_times(given, options, times, ys, t)
+        ys, reached = _with_end(ys, _reached(given, t), y, result)
+    return _Solved(ys, reached, t, result, ends.counts[1], ends.counts[2])
 
 
 def _with_derivatives_in_times(
@@ -481,14 +503,16 @@ def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
         # may be NaN.
         state = given.to_state(harmless(reached, y))
         # Runge-Kutta steps do not preserve the norm of a quaternion.
-        state = dataclasses.replace(state, attitude=normalize(state.attitude))
+        state = dataclasses.replace(state, attitude=unit_again(state.attitude))
         return nan_where(~reached, state)
 
-    states = jax.vmap(state_at)(solved.reached & findings.ok, solved.ys)
-    states = jtu.tree_map(lambda x: x.reshape(*inputs.ts.shape, *x.shape[1:]), states)
+    states = jax.vmap(state_at)(solved.reached, solved.ys)
+    final_state = jtu.tree_map(lambda x: x[-1], states)
+    states = jtu.tree_map(
+        lambda x: x[: inputs.ts.size].reshape(*inputs.ts.shape, *x.shape[1:]), states
+    )
     result = solved.result
     good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    final_state = state_at(good & findings.ok, solved.y)
     lost = good & ~all_finite(final_state)
     result = RESULTS.where(lost, RESULTS.nonfinite_state, result)
     result = RESULTS.where(findings.ok, result, findings.result)

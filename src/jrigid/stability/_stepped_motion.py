@@ -19,12 +19,12 @@ from jrigid._motion import (
     resolves,
     solver_of,
 )
-from jrigid._numerics import safe_norm
+from jrigid._numerics import safe_norm, unit_again
 from jrigid._stepping.method import method_of
 from jrigid._stepping.scales import units
 from jrigid._stepping.step import error_of, stages
 from jrigid.dynamics import State
-from jrigid.rotation import attitude_rate, normalize
+from jrigid.rotation import attitude_rate
 from jrigid.systems import RigidBody
 
 # Largest local error of a step, in the scales of the variables, that a result may have.
@@ -124,7 +124,7 @@ class Walk(NamedTuple):
     def on_sphere(self, y: Array) -> Array:
         """The state with a quaternion of norm 1."""
         # A step changes the norm by its error, and no later rate corrects that.
-        return jnp.concatenate([normalize(y[:4]), y[4:]])
+        return jnp.concatenate([unit_again(y[:4]), y[4:]])
 
     def rates(self, t: Array, y: Array) -> Array:
         """Time derivative of the state."""
