@@ -553,15 +553,24 @@ def _best_move(at: Callable[[Array], _AtState], first: Array) -> Array:
         return _Loop(
             best=jtu.tree_map(lambda a, b: jnp.where(better, a, b), new, best),
             damping=loop.damping * jnp.where(better, _FALL, _RISE),
-            going=promised > _ENOUGH * best.square,
+            # The first turn of the loop has evaluated the start.
+            going=(promised > _ENOUGH * best.square) | (loop.steps < 0),
             steps=loop.steps + 1,
         )
 
+    # The loop evaluates the start, too, so that the program holds the motion once. From
+    # here its step is zero, and every chi-square is better.
+    unknown = _AtState(
+        move=first,
+        square=jnp.full((), jnp.inf, first.dtype),
+        slope=jnp.zeros_like(first),
+        normal=jnp.eye(first.size, dtype=first.dtype),
+    )
     loop = _Loop(
-        best=at(first),
-        damping=jnp.asarray(_FIRST_DAMPING, first.dtype),
+        best=unknown,
+        damping=jnp.asarray(_FIRST_DAMPING / _FALL, first.dtype),
         going=jnp.asarray(True),
-        steps=jnp.asarray(0),
+        steps=jnp.asarray(-1),
     )
     loop = jax.lax.while_loop(
         lambda loop: loop.going & (loop.steps < _STEPS_TO_STATE), step, loop

@@ -38,7 +38,7 @@ class _Loop(NamedTuple):
         damping: Of the next step.
         rise: Factor of the damping if the next step fails.
         going: Whether the search goes on.
-        steps: How many steps were taken.
+        steps: How many steps were taken; -1 before the start is evaluated.
     """
 
     numbers: Float[Array, "lanes numbers"]
@@ -84,14 +84,21 @@ def minimised(
     def is_going(loop: _Loop) -> Array:
         return jnp.any(loop.going) & (loop.steps < steps)
 
-    start = evaluate(numbers)
+    # The loop evaluates the start, too, so that the program holds `quadratic` once. The
+    # first step has the slope zero, and leads nowhere.
+    lanes, count = numbers.shape
+    unknown = Quadratic(
+        chi_square=jnp.full(lanes, jnp.inf, numbers.dtype),
+        slope=jnp.zeros_like(numbers),
+        normal=jnp.zeros((lanes, count, count), numbers.dtype),
+    )
     loop = _Loop(
         numbers=numbers,
-        at=start,
-        damping=jnp.full_like(start.chi_square, _FIRST_DAMPING),
-        rise=jnp.full_like(start.chi_square, 2.0),
-        going=jnp.isfinite(start.chi_square),
-        steps=jnp.asarray(0),
+        at=unknown,
+        damping=jnp.full_like(unknown.chi_square, _FIRST_DAMPING),
+        rise=jnp.full_like(unknown.chi_square, 2.0),
+        going=jnp.full(lanes, True),
+        steps=jnp.asarray(-1),
     )
     found = jax.lax.while_loop(is_going, next_loop, loop)
     return found.numbers, found.at
@@ -113,13 +120,17 @@ def _iteration(loop: _Loop, evaluate: Callable[[Array], Quadratic]) -> _Loop:
         jnp.isfinite(new.normal), axis=(1, 2)
     )
     better = loop.going & finite & (gain > 0)
-    ratio = jnp.where(better, gain / predicted, 0.0)
+    is_first = loop.steps < 0
+    # A ratio of one half leaves the damping as it is.
+    ratio = jnp.where(is_first, 0.5, jnp.where(better, gain / predicted, 0.0))
     fall = jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
     damping = loop.damping * jnp.where(better, fall, loop.rise)
     promising = (predicted > _ENOUGH) | (loop.damping > _UNDAMPED)
+    promising = jnp.where(is_first, finite, promising)
+    taken = better | is_first
 
     def chosen(a: Array, b: Array) -> Array:
-        return jnp.where(better.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+        return jnp.where(taken.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
 
     return _Loop(
         numbers=chosen(numbers, loop.numbers),
