@@ -245,6 +245,24 @@ def test_outputs_at_the_time_of_an_event_have_its_state():
     assert np.isnan(first[~reached]).all()
 
 
+@pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()], ids=["own", "diffrax"])
+def test_an_invalid_lane_is_nan_where_an_event_may_end_it(solver):
+    rates = jnp.array([1.0, jnp.nan])
+
+    def run(rate):
+        state0 = jr.State(UPRIGHT, rate * jnp.array([0.0, 0.0, 1.0]))
+        return jr.simulate(
+            BODY, state0, 5.0, event=TURNED, solver=solver, rtol=1e-6, throw=False
+        )
+
+    motion = quick_jit(jax.vmap(run))(rates)
+    np.testing.assert_allclose(motion.final_time[0], 1.3, rtol=1e-5)
+    assert np.all(np.isfinite(motion.final_state.omega[0]))
+    for part in (motion.states, motion.final_state, motion.final_time):
+        for x in jax.tree.leaves(part):
+            assert np.all(np.isnan(x[1]))
+
+
 # Runs that are too long
 # ----------------------------------------------------------------------
 

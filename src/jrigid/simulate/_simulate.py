@@ -319,7 +319,7 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
     ys = _with_derivatives_in_times(given, options, motion.times, ys, t)
     reached = _reached(given, t)
     if event is not None:
-        ys, reached = _with_end(ys, reached, y, result)
+        ys, reached = _with_end(given, ys, reached, y, result)
     tried = jnp.asarray(stats["num_steps"], jnp.int32)
     accepted = jnp.asarray(stats["num_accepted_steps"], jnp.int32)
     return _Solved(ys, reached, t, result, tried, accepted)
@@ -332,10 +332,11 @@ def _reached(given: Prepared, end: Array) -> Array:
 
 
 def _with_end(
-    ys: Array, reached: Array, y: Array, result: RESULTS
+    given: Prepared, ys: Array, reached: Array, y: Array, result: RESULTS
 ) -> tuple[Array, Array]:
     """States and whether they were reached, with those of the end in a last row."""
     good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+    good = good & given.findings.ok
     return jnp.concatenate([ys, y[None]]), jnp.append(reached, good)
 
 
@@ -393,7 +394,7 @@ def _integrated(
         missing = (number >= ends.counts[3]) & (times <= t)
         ys = jnp.where(missing[:, None], ends.y[None], ys)
         ys = _with_derivatives_in_times(given, options, times, ys, t)
-        ys, reached = _with_end(ys, _reached(given, t), y, result)
+        ys, reached = _with_end(given, ys, _reached(given, t), y, result)
     return _Solved(ys, reached, t, result, ends.counts[1], ends.counts[2])
 
 
