@@ -165,25 +165,23 @@ def _of_field(result: FitResult) -> str:
 def _of_minimum(result: FitResult) -> str:
     """What to try where the search may have ended in a wrong minimum."""
     failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
+    is_misfit = result.status == Status.MISFIT
     unexplained = float(result.diagnostics.unexplained)
-    left = result.status == Status.MISFIT and unexplained > _MUCH_LEFT
+    sentences = []
+    if is_misfit and unexplained > _MUCH_LEFT:
+        sentences.append(
+            f"A part of {unexplained:.2g} of the square of the record is left: the "
+            "search may have ended in a wrong minimum."
+        )
     # Where rates or attitudes are read, they show where the search begins.
     is_seen = any(isinstance(x, Gyro | AttitudeSensor) for x in result.fitted()[1:])
-    if not (failed or left):
-        return ""
-    sentence = ""
-    if left:
-        sentence = (
-            f"A part of {unexplained:.2g} of the square of the record is left: the "
-            "search may have ended in a wrong minimum. "
+    if (failed or is_misfit) and not is_seen:
+        sentences.append(
+            "No sensor reads rates or attitudes, so that the search depends on where "
+            "it begins: pass a tensor and a state (`start`), or first fit a part of "
+            "the record in which the body turns a few times."
         )
-    if is_seen:
-        return sentence.strip()
-    return sentence + (
-        "No sensor reads rates or attitudes, so that the search depends on where it "
-        "begins: pass a tensor and a state (`start`), or first fit a part of the "
-        "record in which the body turns a few times."
-    )
+    return " ".join(sentences)
 
 
 def _may_turn_the_other_way(result: FitResult) -> bool:
