@@ -577,6 +577,11 @@ def _first_failed(failed: list[AnyBool]) -> Array:
     return first.astype(jnp.int32)
 
 
+def is_without_error(result: Any) -> AnyBool:
+    """Whether a result code reports no error."""
+    return (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+
+
 def settle(
     answer: Tree,
     throw: bool,
@@ -600,7 +605,7 @@ def settle(
     if not throw:
         return answer
     result: Any = answer.result  # pyright: ignore[reportAttributeAccessIssue]
-    good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
+    good = is_without_error(result)
     return _refuse(
         answer, ~good, lambda: _diagnosis(findings, ~good, result, *arguments)
     )

@@ -98,14 +98,12 @@ def largest_steps(
     """
     # A method of this order omits the term x^(order + 1) / (order + 1)! of a step of x
     # radians. This is x^order / (order + 1)! for each radian.
-    for_values, for_derivatives = (
-        jnp.clip(
-            (math.factorial(order + 1) * tolerances * rtol) ** (1 / order),
-            SMALLEST_BOUND,
-            largest,
-        )
-        for tolerances, largest in zip(_TOLERANCES, _LARGEST_BOUNDS, strict=True)
-    )
+
+    def longest(tolerances: float, bound: float) -> Array:
+        error = math.factorial(order + 1) * tolerances * rtol
+        return jnp.clip(error ** (1 / order), SMALLEST_BOUND, bound)
+
+    for_values, for_derivatives = map(longest, _TOLERANCES, _LARGEST_BOUNDS)
     return for_values, for_derivatives
 
 

@@ -19,6 +19,7 @@ from jrigid._checks import (
     Findings,
     all_finite,
     harmless,
+    is_without_error,
     nan_where,
     settle,
 )
@@ -335,8 +336,7 @@ def _with_end(
     given: Prepared, ys: Array, reached: Array, y: Array, result: RESULTS
 ) -> tuple[Array, Array]:
     """States and whether they were reached, with those of the end in a last row."""
-    good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    good = good & given.findings.ok
+    good = is_without_error(result) & given.findings.ok
     return jnp.concatenate([ys, y[None]]), jnp.append(reached, good)
 
 
@@ -513,8 +513,7 @@ def _trajectory(given: Prepared, inputs: Inputs, solved: _Solved) -> Trajectory:
         lambda x: x[: inputs.ts.size].reshape(*inputs.ts.shape, *x.shape[1:]), states
     )
     result = solved.result
-    good = (result == RESULTS.successful) | (result == RESULTS.event_occurred)
-    lost = good & ~all_finite(final_state)
+    lost = is_without_error(result) & ~all_finite(final_state)
     result = RESULTS.where(lost, RESULTS.nonfinite_state, result)
     result = RESULTS.where(findings.ok, result, findings.result)
     final_time = usable.t0 + solved.t.astype(usable.t0.dtype)
