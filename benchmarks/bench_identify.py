@@ -12,8 +12,8 @@ Cells of their own (`--cells`: these alone) have what a plain fit does not expec
 records by an independent integrator (tests/worlds.py): a body of moments 1, 1.7, 2.3
 whose axes and spin are drawn anew for each, 1 % noise, ten turns of 20 samples, unless
 said. Counted are the fits that end OK, and how many of their 95 % intervals (1.96
-errors) hold the truth. White torque is in units of what moves the rates by the noise
-from one sample to the next.
+errors) hold the truth; those of a level are of its logarithm. White torque is in units
+of what moves the rates by the noise from one sample to the next.
 
 Peers start from the same: a sphere and the first reading.
 `scipy.optimize.least_squares` differs the exact flow by finite differences; Adam
@@ -206,7 +206,10 @@ def scene(rng, count, ts, spin=1.0, **motion):
 
 def smoothed(values):
     found = fit(SPHERE, Rates(TEN, values, SIGMA), unmodelled="estimate", throw=False)
-    return found, {"level": (found.level[0], found.level_errors[0])}
+    level, error = float(found.level[0]), float(found.level_errors[0])
+    # An error of a level is that of its logarithm; none is counted as its own error.
+    level = level if level > 0 else error
+    return found, {"level": (np.log(level), error / level)}
 
 
 def delayed(values, attitudes):
@@ -289,7 +292,7 @@ def unmodelled(rng, count, size):
     tensors, moved = scene(rng, count, TEN, kick=size * LEVEL)
     values = moved.omega + SIGMA * rng.normal(size=moved.omega.shape)
     label = f"white torque, {size:g} of the noise"
-    return covered(label, smoothed, (values,), tensors, {"level": size * LEVEL})
+    return covered(label, smoothed, (values,), tensors, {"level": np.log(size * LEVEL)})
 
 
 def half_a_sample_late(rng, count):

@@ -298,6 +298,30 @@ def test_errors_include_those_of_the_torque(monkeypatch):
     np.testing.assert_allclose(found.ratios_errors, total, rtol=0.1)
 
 
+@pytest.mark.parametrize("parts", [(1.0, 1.0, 1.0), (0.4, 1.0, 2.5)])
+def test_levels_and_times_that_are_not_there_are_seldom_found(parts):
+    """Akaike's criterion finds unlike levels, or a time, in several of these 12."""
+    rng = np.random.default_rng(7)
+    ts = np.arange(200) * np.pi / 10
+    turns = np.stack([worlds.random_axes(rng) for _ in range(12)])
+    tensors = np.einsum("nij,j,nkj->nik", turns, MOMENTS / MOMENTS.mean(), turns)
+    omega = worlds.times(turns, np.array([0.5, 1.0, 0.4]))
+    noise = 0.01
+    # A torque of this level changes a rate by its noise from sample to sample.
+    level = noise / np.sqrt(ts[1])
+    moved = worlds.tumble(tensors, omega, ts, rng=rng, kick=level * np.array(parts))
+    readings = moved.omega + noise * rng.normal(size=moved.omega.shape)
+    body = jr.RigidBody(np.ones(3))
+    found = [
+        identify.fit(body, identify.Rates(ts, x, noise), unmodelled="estimate")
+        for x in readings
+    ]
+    unlike = sum(not np.allclose(x.level, x.level[0]) for x in found)
+    correlated = sum(bool(np.any(x.correlation_time > 0)) for x in found)
+    assert unlike <= 1 if len(set(parts)) == 1 else unlike == 12
+    assert correlated <= 1
+
+
 def test_a_torque_that_is_given_is_used(rng):
     records = some_trials(rng, 2)
     record = records[0]

@@ -25,7 +25,9 @@ _TRIED_FRACTIONS = (1.0, 0.3, 0.1, 0.01)  # of a step
 _UNKNOWN = 10.0  # error of the logarithm of a level that could have any size
 _HIGHEST = 30.0  # logarithm of a level, in units of the first, above all real ones
 _TRIED = 2.0  # logarithm of the first time tried, in units of the shortest
-_GAIN = 2.0  # in -2 log likelihood, for each further number (Akaike)
+# What a number costs, in -2 log likelihood. With Akaike's cost of 2 one of seven records
+# under equal levels seems to have three, whose errors are then too small.
+_COST = 4.0
 # A trial has another body if -2 log likelihood falls by more than this, beyond one for
 # each number, where it has numbers of its own. Few trials do not show which of them it
 # is, nor do trials of which many seem to have another body.
@@ -52,6 +54,14 @@ class Form(NamedTuple):
         """How many numbers there are."""
         return self.levels + self.times
 
+    def contains(self, other: "Form") -> bool:
+        """Whether each torque of the other form is one of this form."""
+        return other.levels <= self.levels and other.times <= self.times
+
+
+# Forms beside white torque of one level, simple ones first.
+_WIDER = (Form(1, 1), Form(3, 0), Form(3, 1), Form(3, 3))
+
 
 class Torque(NamedTuple):
     """A torque as a vector of numbers.
@@ -75,6 +85,11 @@ class Torque(NamedTuple):
     def size(self) -> int:
         """How many numbers were sought, with the sizes of trials if they were."""
         return self.form.size + (self.trials.size if self.own_sizes else 0)
+
+    @property
+    def cost(self) -> float:
+        """-2 log likelihood of the record, and what the numbers of the form cost."""
+        return self.minus_two_log_likelihood + _COST * self.form.size
 
     @property
     def levels(self) -> np.ndarray:
@@ -312,23 +327,15 @@ class Search:
             # Such sizes follow from the spins and cost no number, so that any gain
             # decides for them.
             proportional = best._replace(trials=np.log(spins) - np.mean(np.log(spins)))
-            best = self._better(best, self._descended(proportional, likelihood))
-        for form in (Form(1, 1), Form(3, 0), Form(3, 1), Form(3, 3)):
-            # Each form begins at the best torque so far, which must be a special case
-            # of it.
-            if form.times < best.form.times or form.levels < best.form.levels:
-                continue
-            wider = self._descended(self._widened(best, form), likelihood)
-            best = self._better(best, wider)
+            best = _cheapest([best, self._descended(proportional, likelihood)])
+        found = [best]
+        for form in _WIDER:
+            simpler = _cheapest([x for x in found if form.contains(x.form)])
+            found.append(self._descended(self._widened(simpler, form), likelihood))
+        best = _cheapest(found)
         if spins.size > 1:
             best = self._with_trials(best, likelihood)
         return best
-
-    def _better(self, one: Torque, other: Torque) -> Torque:
-        """The other torque if it is more likely by more than its numbers cost."""
-        cost = _GAIN * (other.form.size - one.form.size)
-        gain = one.minus_two_log_likelihood - other.minus_two_log_likelihood
-        return other if gain > cost else one
 
     def _widened(self, torque: Torque, form: Form) -> Torque:
         """The same torque in a form of more numbers."""
@@ -398,6 +405,11 @@ class Search:
         values, axes = np.linalg.eigh(finite)
         # The value is twice the logarithm.
         return (axes * (2 / np.maximum(values, 1e-12))) @ axes.T
+
+
+def _cheapest(torques: list[Torque]) -> Torque:
+    """The torque of least cost, of equal ones the first."""
+    return min(torques, key=lambda x: x.cost)
 
 
 def _with_sizes(torque: Torque, likelihood: Likelihood) -> Function:
