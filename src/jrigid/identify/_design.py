@@ -506,7 +506,7 @@ def _profile(
     of_bounds = np.sum(np.where(is_bound, result.diagnostics.residuals**2, 0.0))
     least = result.chi_square + of_bounds
     growth = []
-    for minimum in minima(requests, len(requests)):
+    for minimum in minima(requests):
         # The noise that errors go by has the variance `inflation` in these units.
         added = (minimum.square - least) / inflation
         growth.append(added if minimum.settled else np.nan)

@@ -5,7 +5,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -42,7 +42,7 @@ from jrigid.identify._layout import (
     segments_needed,
     whole,
 )
-from jrigid.identify._minimise import tensors_at
+from jrigid.identify._minimise import Minimum, tensors_at
 from jrigid.identify._problem import Options, Problem, SimulatedWithParts
 from jrigid.identify._quality import Fit
 from jrigid.identify._readings import (
@@ -68,6 +68,7 @@ from jrigid.identify._search import (
     Case,
     Effort,
     Line,
+    Request,
     Starts,
     attempt,
     no_search,
@@ -852,31 +853,33 @@ def _unknowns(
 
 def _fits(tasks: Sequence[_Task], effort: Effort, throw: bool) -> list[dict[str, Any]]:
     """Fit records side by side: the fields of each result."""
-    cases = [_case(x, effort, throw) for x in tasks]
-    # A record that cannot be used takes no steps, but its result has the same arrays.
-    searches = [
-        search(case) if is_good(result) else no_search(case) for case, result in cases
-    ]
     columns = zip(*(_lengths(x.records) for x in tasks), strict=True)
     # Results of many fits are stacked, so that all are as long as the longest record.
     lengths = [max(x) for x in columns]
-    results = []
-    for task, case, best in zip(tasks, cases, run(searches), strict=True):
-        _, input_result = case
-        fields = conclude(best, lengths, input_result)
-        if is_good(input_result):
-            fields["conventions"] = _conventions(task, best, effort)
-        for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
-            if throw and int(fields["status"]) == int(status):
-                text = reason(result_of(fields))
-                raise RuntimeError(f"{Status[status]} {text}".strip())
-        results.append(fields)
-    return results
+    return run(_fields(x, effort, throw, lengths) for x in tasks)
+
+
+def _fields(
+    task: _Task, effort: Effort, throw: bool, lengths: Sequence[int]
+) -> Generator[Request, Minimum, dict[str, Any]]:
+    """Fit a record: the fields of the result, with residuals of these lengths."""
+    case, input_result = _case(task, effort, throw)
+    # A record that cannot be used takes no steps, but its result has the same arrays.
+    good = is_good(input_result)
+    best = yield from search(case) if good else no_search(case)
+    fields = conclude(best, lengths, input_result)
+    if good:
+        fields["conventions"] = yield from _conventions(task, best, effort)
+    for status in (Status.WRONG_BASIN, Status.NOT_CONVERGED):
+        if throw and int(fields["status"]) == int(status):
+            text = reason(result_of(fields))
+            raise RuntimeError(f"{Status[status]} {text}".strip())
+    return fields
 
 
 def _conventions(
     task: _Task, best: Fit, effort: Effort
-) -> Bool[np.ndarray, " conventions"]:
+) -> Generator[Request, Minimum, Bool[np.ndarray, " conventions"]]:
     """In which other conventions the record would fit; in none if it is not far."""
     found = np.zeros(conventions.COUNT, bool)
     if not conventions.is_far(best):
@@ -885,7 +888,8 @@ def _conventions(
     by_turns = conventions.of_turns(records)
     if by_turns is None:
         for index, changed in conventions.readings(records):
-            found[index] = _fits_as(task._replace(records=changed), best, effort)
+            other = task._replace(records=changed)
+            found[index] = yield from _fits_as(other, best, effort)
     else:
         found |= by_turns
     systems = conventions.wheels_reversed(task.systems)
@@ -893,19 +897,20 @@ def _conventions(
         one, *others = systems
         bodies = _Bodies(systems if others else one)
         systems = bodies.of_trials(task.records[0].ts.shape[0])
-        changed = task._replace(bodies=bodies, systems=systems)
-        found[conventions.WHEELS] = _fits_as(changed, best, effort)
+        other = task._replace(bodies=bodies, systems=systems)
+        found[conventions.WHEELS] = yield from _fits_as(other, best, effort)
     return found
 
 
-def _fits_as(task: _Task, best: Fit, effort: Effort) -> bool:
+def _fits_as(
+    task: _Task, best: Fit, effort: Effort
+) -> Generator[Request, Minimum, bool]:
     """Whether a record fits that was changed, while it did not before."""
     case, input_result = _case(task, effort, False)
     if not is_good(input_result):
         return False
     # A record that is read rightly needs no second search.
-    first = attempt(case, case.problem, case.starts[0], slow=False)
-    (other,) = run([first])
+    other = yield from attempt(case, case.problem, case.starts[0], slow=False)
     return conventions.explains(other, best)
 
 

@@ -6,10 +6,10 @@ whose requests share compiled calls.
 """
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -65,6 +65,7 @@ _GAP = 3.5  # radians between nodes: a segment without samples, longer than othe
 # The most records of one compiled call on a GPU. On a CPU each call takes one, as `fit`
 # does: lanes wait for the slowest, which costs more than the overhead that they share.
 _LANES = 8
+_WAITING = 8  # calls, for which there may be requests before another search begins
 # Steps of one call. A call lasts until its slowest lane has ended, so that a record
 # which needs hundreds of steps makes others wait; but most stages end in one call.
 _IN_A_CALL = 32
@@ -101,7 +102,9 @@ _BENT = 2.0
 _RIVAL = 25.0  # growth of chi-square beyond which another minimum does not matter
 
 
-class Line(eqx.Module):
+@jtu.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Line:
     """Holds the numbers on a plane: a residual that is zero there."""
 
     direction: AnyArray
@@ -238,6 +241,7 @@ class Request(NamedTuple):
 
 
 Search = Generator[Request, Minimum, Fit]
+_Value = TypeVar("_Value")
 
 
 def stages_of(case: Case, slow: bool) -> list[Stage]:
@@ -817,35 +821,78 @@ def _error_by_probe(
     return abs(step) / distance
 
 
+class _Call(NamedTuple):
+    """A compiled call that is under way, or has ended.
+
+    Attributes:
+        indices: Of the searches that asked for it.
+        results: A `Minimum` of arrays that may still be computed, with lanes in front.
+    """
+
+    indices: list[int]
+    results: Minimum
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the results are there."""
+        return self.results.square.is_ready()
+
+    def answers(self) -> list[tuple[int, Minimum]]:
+        """What each search asked for; waits until the call has ended."""
+        minima = _of_lanes(self.results, len(self.indices))
+        return list(zip(self.indices, minima, strict=True))
+
+
 @np.errstate(all="ignore")  # attempts may run out of the range of numbers
-def run(searches: Iterable[Search]) -> list[Fit]:
-    """Carry out a search, or many side by side: their requests share compiled calls."""
+def run(searches: Iterable[Generator[Request, Minimum, _Value]]) -> list[_Value]:
+    """Carry out a search, or many: what each of them returns.
+
+    Requests of equal shapes share compiled calls on a GPU. JAX computes in the
+    background: while a call is under way, Python does what other searches need. One
+    call at a time: two would share the cores, and neither would end sooner.
+    """
     searches = list(searches)
     is_batched = len(searches) > 1 and jax.default_backend() != "cpu"
     lanes = _LANES if is_batched else 1
-    fits: list[Any] = [None] * len(searches)
+    values: list[Any] = [None] * len(searches)
     # What can be answered in one call, by shapes: requests by the index of the search.
     waiting: dict[Any, dict[int, Request]] = {}
+    not_begun = deque(range(len(searches)))
+    answered: deque[tuple[int, Minimum]] = deque()
+    call: _Call | None = None
 
     def go_on(index: int, answer: Any) -> None:
         try:
             request = searches[index].send(answer)
         except StopIteration as end:
-            fits[index] = end.value
+            values[index] = end.value
         else:
             waiting.setdefault(_shapes(request), {})[index] = request
 
-    for index in range(len(searches)):
-        go_on(index, None)
-    while any(waiting.values()):
-        # Lanes cost time whether they are used or not, so that the fullest call is
-        # next: a few requests wait until other searches ask for the same shapes.
-        requests = max(waiting.values(), key=len)
-        indices = list(requests)[:lanes]
-        together = [requests.pop(i) for i in indices]
-        for index, minimum in zip(indices, minima(together, lanes), strict=True):
-            go_on(index, minimum)
-    return fits
+    def fullest() -> dict[int, Request]:
+        return max(waiting.values(), key=len, default={})
+
+    def may_begin() -> bool:
+        # More than a few that wait take memory, and keep nobody busy.
+        return bool(not_begun) and len(fullest()) < _WAITING * lanes
+
+    while call or answered or not_begun or fullest():
+        idle = not answered and not may_begin()
+        if call is not None and (idle or call.has_ended):
+            answered.extend(call.answers())
+            call = None
+        # Lanes cost time whether they are used or not, so that a call which is not full
+        # waits for what other searches ask.
+        is_full = len(fullest()) >= lanes
+        if call is None and (is_full or not (answered or may_begin())):
+            requests = fullest()
+            indices = list(requests)[:lanes]
+            call = _Call(indices, _called([requests.pop(i) for i in indices], lanes))
+        if answered:
+            go_on(*answered.popleft())
+        elif may_begin():
+            go_on(not_begun.popleft(), None)
+    return values
 
 
 def _shapes(request: Request) -> Any:
@@ -854,7 +901,7 @@ def _shapes(request: Request) -> Any:
     return tree, tuple(np.shape(x) for x in leaves)
 
 
-def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
+def _called(requests: Sequence[Request], lanes: int) -> Minimum:
     """Minimise side by side; unused lanes repeat the first one, without steps."""
     # The compiled call has a fixed number of lanes. Without steps a lane ends at once.
     idle = requests[0]._replace(
@@ -862,5 +909,16 @@ def minima(requests: Sequence[Request], lanes: int) -> list[Minimum]:
     )
     padded = [*requests, *[idle] * (lanes - len(requests))]
     stacked = jtu.tree_map(lambda *x: np.array([np.asarray(y) for y in x]), *padded)
-    results = jtu.tree_map(np.asarray, minimise(*stacked))
-    return [jtu.tree_map(lambda x, i=i: x[i], results) for i in range(len(requests))]
+    return minimise(*stacked)
+
+
+def _of_lanes(results: Minimum, count: int) -> list[Minimum]:
+    """The first so many results, as numpy arrays."""
+    results = jtu.tree_map(np.asarray, results)
+    return [jtu.tree_map(lambda x, i=i: x[i], results) for i in range(count)]
+
+
+def minima(requests: Sequence[Request]) -> list[Minimum]:
+    """Minimise side by side."""
+    count = len(requests)
+    return _of_lanes(_called(requests, count), count)

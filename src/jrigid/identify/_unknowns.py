@@ -372,7 +372,9 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
     return [picks[index] for index in sorted(picks)]
 
 
-class Unknowns(eqx.Module):
+@jtu.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Unknowns:
     """What is sought, in what numbers, around what system and sensors.
 
     Attributes:
@@ -392,12 +394,12 @@ class Unknowns(eqx.Module):
     """
 
     given: tuple[Any, ...]
-    rest: tuple[Any, ...] = eqx.field(static=True)
-    stacked: tuple[bool, ...] = eqx.field(static=True)
+    rest: tuple[Any, ...] = dataclasses.field(metadata={"static": True})
+    stacked: tuple[bool, ...] = dataclasses.field(metadata={"static": True})
     sought: tuple[AbstractSought, ...]
     groups: dict[str, AnyArray]
     inertia_model: AbstractInertiaModel
-    scaled: bool = eqx.field(static=True)
+    scaled: bool = dataclasses.field(metadata={"static": True})
     trace: AnyArray
     rate: AnyArray
     hold: Callable[["Unknowns", Array], Array] | None = None
