@@ -1,11 +1,11 @@
 """The least-squares problem of a record: residuals, gaps and their derivatives."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -72,12 +72,10 @@ class Options(NamedTuple):
         return 6 if self.depends_on_attitude else 3
 
 
-@jtu.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(eqx.Module):
     """A record as it is fitted."""
 
-    options: Options = dataclasses.field(metadata={"static": True})
+    options: Options = eqx.field(static=True)
     unknowns: Unknowns
     samples: Samples
     noise: AnyArray  # of rates [rad/s] and turns [rad], (6,), for the links

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -102,9 +103,7 @@ _BENT = 2.0
 _RIVAL = 25.0  # growth of chi-square beyond which another minimum does not matter
 
 
-@jtu.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class Line:
+class Line(eqx.Module):
     """Holds the numbers on a plane: a residual that is zero there."""
 
     direction: AnyArray

@@ -372,9 +372,7 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
     return [picks[index] for index in sorted(picks)]
 
 
-@jtu.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class Unknowns:
+class Unknowns(eqx.Module):
     """What is sought, in what numbers, around what system and sensors.
 
     Attributes:
@@ -394,12 +392,12 @@ class Unknowns:
     """
 
     given: tuple[Any, ...]
-    rest: tuple[Any, ...] = dataclasses.field(metadata={"static": True})
-    stacked: tuple[bool, ...] = dataclasses.field(metadata={"static": True})
+    rest: tuple[Any, ...] = eqx.field(static=True)
+    stacked: tuple[bool, ...] = eqx.field(static=True)
     sought: tuple[AbstractSought, ...]
     groups: dict[str, AnyArray]
     inertia_model: AbstractInertiaModel
-    scaled: bool = dataclasses.field(metadata={"static": True})
+    scaled: bool = eqx.field(static=True)
     trace: AnyArray
     rate: AnyArray
     hold: Callable[["Unknowns", Array], Array] | None = None
