@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jrigid as jr
-from jrigid.photometry import _model, _readings, _scan
+from jrigid.photometry import _curve_readings, _model, _scan
 
 EPOCHS = 384
 
@@ -68,7 +68,7 @@ def readings():
     angle = ts / 1e7
     sun = np.stack([np.cos(angle), np.sin(angle), 0.1 + 0 * ts], axis=1)
     observer = np.stack([np.sin(angle), np.cos(angle), 0.2 + 0 * ts], axis=1)
-    return _readings.Readings(
+    return _curve_readings.Readings(
         ts=ts,
         to_sun=sun / np.linalg.norm(sun, axis=1, keepdims=True),
         to_observer=observer / np.linalg.norm(observer, axis=1, keepdims=True),
@@ -109,7 +109,7 @@ def scan(motions):
     turned = _scan.orientations()
     first, least, _ = bench_lanes.seconds(_scan.scanned, numbers, tasks, turned, few)
     many = motions * len(turned)
-    name = f"scan of starting points, {_readings.EPOCHS} epochs: {many:,}"
+    name = f"scan of starting points, {_curve_readings.EPOCHS} epochs: {many:,}"
     return [name, first, least, many, None]
 
 

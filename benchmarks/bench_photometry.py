@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _scan
-from jrigid.photometry._orbit import SPEED_OF_LIGHT
+from jrigid.photometry._sun_and_earth import SPEED_OF_LIGHT
 
 HOUR, YEAR, AU = 3600.0, 365.25 * 86400, 149597870700.0
 EPOCHS = 1200

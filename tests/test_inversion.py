@@ -12,13 +12,13 @@ import tumbler_reference
 import jrigid as jr
 from jrigid import photometry as ph
 from jrigid.photometry import _alias as alias
+from jrigid.photometry import _curve_readings as readings
+from jrigid.photometry import _many_starts as refine
 from jrigid.photometry import _model as model
 from jrigid.photometry import _nights as nights
 from jrigid.photometry import _periodogram as periodogram
-from jrigid.photometry import _readings as readings
-from jrigid.photometry import _refine as refine
-from jrigid.photometry import _search as search
 from jrigid.photometry import _spin_search as spin_search
+from jrigid.photometry import _tumbler_search as search
 from jrigid.photometry import _wobble as wobble
 from jrigid.photometry._convex import even_directions
 from jrigid.photometry._inversion import in_hours

@@ -13,10 +13,10 @@ from scipy.special import sph_harm_y
 from jrigid import photometry as ph
 from jrigid._core.host_rows import rows_of
 from jrigid.photometry import _convex as convex
-from jrigid.photometry import _readings as readings
+from jrigid.photometry import _curve_readings as readings
 from jrigid.photometry import _spin as spin
 from jrigid.photometry import _spin_search as search
-from jrigid.photometry._refine import Quadratic
+from jrigid.photometry._many_starts import Quadratic
 
 HOUR, DAY, AU = 3600.0, 86400.0, 149597870700.0
 PERIOD = 7.1 * HOUR

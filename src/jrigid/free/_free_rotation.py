@@ -21,7 +21,7 @@ from jrigid._checks import (
 from jrigid._core.compile import one_program
 from jrigid._core.lanes import as_lanes, some_at_a_time
 from jrigid._core.third_party import unvmap_any
-from jrigid._motion import exact_motion, plain_state
+from jrigid._motion_inputs import exact_motion, plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid._types import InertiaLike, Quaternion, Real, ScalarLike, Vector, VectorLike

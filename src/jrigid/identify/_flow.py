@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jrigid._core.inline import inlined
-from jrigid._motion import depends_on
+from jrigid._motion_inputs import depends_on
 from jrigid._numerics import product
 from jrigid._spectral import eigh, from_principal_axes
 from jrigid._stepping.method import Method, method_of

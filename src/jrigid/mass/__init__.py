@@ -13,8 +13,8 @@ from jrigid.mass._axes import principal_axes as principal_axes
 from jrigid.mass._axes import second_moment as second_moment
 from jrigid.mass._axes import tensor_function as tensor_function
 from jrigid.mass._axes import to_center_of_mass as to_center_of_mass
-from jrigid.mass._body import MassProperties as MassProperties
-from jrigid.mass._body import PrincipalAxes as PrincipalAxes
+from jrigid.mass._mass_body import MassProperties as MassProperties
+from jrigid.mass._mass_body import PrincipalAxes as PrincipalAxes
 from jrigid.mass._mesh import from_mesh as from_mesh
 from jrigid.mass._points import from_density as from_density
 from jrigid.mass._points import from_points as from_points

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int
 from jrigid._checks import Findings, check_shape, harmless, is_concrete, shaped
 from jrigid._types import AnyArray, Matrix, Real, Scalar, ScalarLike, Vector
 from jrigid.mass._axes import ULPS, inertia_of_second_moment, is_physical
-from jrigid.mass._body import MassProperties
+from jrigid.mass._mass_body import MassProperties
 from jrigid.mass._points import PAIRS, lane_sum, symmetric
 
 _OPEN = (

@@ -19,7 +19,7 @@ from jrigid._checks import (
 from jrigid._numerics import product
 from jrigid._types import Matrix, Real, Scalar, Vector, VectorLike
 from jrigid.mass._axes import inertia_of_second_moment
-from jrigid.mass._body import MassProperties
+from jrigid.mass._mass_body import MassProperties
 
 # Partial sums over points. Naive float32 sums of 10^6 terms lose four digits, and XLA's
 # reductions and products of tall thin matrices run below numpy's speed on a CPU. Lanes

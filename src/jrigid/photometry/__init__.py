@@ -18,21 +18,17 @@ from jrigid.photometry._alias import Estimates as Estimates
 from jrigid.photometry._astropy import (
     geometry_of_coordinates as geometry_of_coordinates,
 )
+from jrigid.photometry._damit_files import LightCurve as LightCurve
+from jrigid.photometry._damit_files import read_light_curves as read_light_curves
+from jrigid.photometry._damit_files import read_shape as read_shape
 from jrigid.photometry._ellipsoid import Ellipsoid as Ellipsoid
 from jrigid.photometry._facets import Facets as Facets
 from jrigid.photometry._facets import facets_from_mesh as facets_from_mesh
-from jrigid.photometry._files import LightCurve as LightCurve
-from jrigid.photometry._files import read_light_curves as read_light_curves
-from jrigid.photometry._files import read_shape as read_shape
 from jrigid.photometry._inversion import Inversion as Inversion
 from jrigid.photometry._inversion import find_tumblers as find_tumblers
 from jrigid.photometry._light_curve import brightness as brightness
 from jrigid.photometry._light_curve import light_curve as light_curve
 from jrigid.photometry._nights import NightPlan as NightPlan
-from jrigid.photometry._orbit import Orbit as Orbit
-from jrigid.photometry._orbit import earth_position as earth_position
-from jrigid.photometry._orbit import geometry_of_orbit as geometry_of_orbit
-from jrigid.photometry._orbit import geometry_of_table as geometry_of_table
 from jrigid.photometry._periodogram import PeriodPairs as PeriodPairs
 from jrigid.photometry._periodogram import period_pairs as period_pairs
 from jrigid.photometry._pole import state_of_pole as state_of_pole
@@ -49,6 +45,10 @@ from jrigid.photometry._spin import Spin as Spin
 from jrigid.photometry._spin import SpinEstimates as SpinEstimates
 from jrigid.photometry._spin import SpinInversion as SpinInversion
 from jrigid.photometry._spin import find_spin as find_spin
+from jrigid.photometry._sun_and_earth import Orbit as Orbit
+from jrigid.photometry._sun_and_earth import earth_position as earth_position
+from jrigid.photometry._sun_and_earth import geometry_of_orbit as geometry_of_orbit
+from jrigid.photometry._sun_and_earth import geometry_of_table as geometry_of_table
 from jrigid.photometry._tumbler import Tumbler as Tumbler
 from jrigid.photometry._tumbling import Tumbling as Tumbling
 from jrigid.photometry._tumbling import omega_from_energy as omega_from_energy

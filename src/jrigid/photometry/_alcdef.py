@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 from jrigid._checks import demand
 from jrigid.photometry._astropy import TDB, TIME_SCALES, in_tdb
-from jrigid.photometry._files import ASTRONOMICAL_UNIT, LightCurve
-from jrigid.photometry._orbit import (
+from jrigid.photometry._damit_files import ASTRONOMICAL_UNIT, LightCurve
+from jrigid.photometry._sun_and_earth import (
     LEAST_DATE,
     Positions,
     Vectors,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jrigid._numerics import product
 from jrigid._types import AnyArray
+from jrigid.photometry._curve_readings import Readings
 from jrigid.photometry._ellipsoid import Ellipsoid
 from jrigid.photometry._model import (
     Geometry,
@@ -27,7 +28,6 @@ from jrigid.photometry._model import (
     sought,
     unpacked,
 )
-from jrigid.photometry._readings import Readings
 from jrigid.photometry._tumbler import Tumbler
 
 MODES = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from jrigid._checks import demand
 from jrigid._extra import extra
-from jrigid.photometry._orbit import Positions, Vectors, geometry_of_table
+from jrigid.photometry._sun_and_earth import Positions, Vectors, geometry_of_table
 
 # Astropy is an extra, so that its classes cannot be named here.
 SkyCoord = Any  # `astropy.coordinates.SkyCoord`

@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float
 
 from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix, Scalar, Vector
+from jrigid.photometry._curve_readings import EPOCHS, Readings
 from jrigid.photometry._facets import Facets
 from jrigid.photometry._light_curve import phase_angle
+from jrigid.photometry._many_starts import Quadratic
 from jrigid.photometry._model import Rows, axes_of_momentum
-from jrigid.photometry._readings import EPOCHS, Readings
-from jrigid.photometry._refine import Quadratic
 from jrigid.photometry._scattering import Mixture
 
 SCATTERING = ("lambert", "amplitude", "width", "slope")

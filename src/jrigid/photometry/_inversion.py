@@ -14,7 +14,15 @@ from jrigid.photometry._alias import (
     alias_of,
     log_evidence,
 )
-from jrigid.photometry._files import LightCurve
+from jrigid.photometry._curve_readings import (
+    Readings,
+    check_threshold,
+    follows,
+    noise_in_words,
+    readings_of,
+    stated_noise,
+)
+from jrigid.photometry._damit_files import LightCurve
 from jrigid.photometry._model import Task, independent
 from jrigid.photometry._nights import (
     NightPlan,
@@ -24,15 +32,7 @@ from jrigid.photometry._nights import (
     predictions,
 )
 from jrigid.photometry._periodogram import cycles_within, points_of
-from jrigid.photometry._readings import (
-    Readings,
-    check_threshold,
-    follows,
-    noise_in_words,
-    readings_of,
-    stated_noise,
-)
-from jrigid.photometry._search import APART, Found, index_of_mirror, search
+from jrigid.photometry._tumbler_search import APART, Found, index_of_mirror, search
 
 _INERTIA = ("homogeneous", "free")
 # Noise of the first search where none is given [mag]; what is left replaces it.

@@ -13,8 +13,8 @@ from jrigid.dynamics import State
 from jrigid.free import free_rotation
 from jrigid.photometry._ellipsoid import Ellipsoid
 from jrigid.photometry._facets import Facets, as_unit
-from jrigid.photometry._orbit import SPEED_OF_LIGHT
 from jrigid.photometry._scattering import AbstractScattering, LommelSeeliger
+from jrigid.photometry._sun_and_earth import SPEED_OF_LIGHT
 from jrigid.rotation import rotate_inverse
 from jrigid.simulate import simulate
 from jrigid.systems import RigidBody

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jrigid._numerics import product
 from jrigid._types import AnyArray, Matrix, Scalar, Vector
+from jrigid.photometry._curve_readings import Readings
 from jrigid.photometry._ellipsoid import lommel_seeliger_brightness
-from jrigid.photometry._readings import Readings
-from jrigid.photometry._refine import Quadratic
+from jrigid.photometry._many_starts import Quadratic
 from jrigid.photometry._wobble import Wobble, body_axes, wobble
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from jrigid._checks import demand
 from jrigid.photometry._alias import Alias, rows_at
-from jrigid.photometry._files import LightCurve
-from jrigid.photometry._readings import orthonormal, readings_of
+from jrigid.photometry._curve_readings import orthonormal, readings_of
+from jrigid.photometry._damit_files import LightCurve
 
 _DAY = 86400.0
 

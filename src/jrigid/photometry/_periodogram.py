@@ -19,8 +19,8 @@ from jrigid._checks import demand
 from jrigid._core.host_rows import in_batches
 from jrigid._numerics import product
 from jrigid._types import Scalar
-from jrigid.photometry._files import LightCurve
-from jrigid.photometry._readings import Readings, check_list, readings_of
+from jrigid.photometry._curve_readings import Readings, check_list, readings_of
+from jrigid.photometry._damit_files import LightCurve
 
 # Frequencies in one resolution element, 1 over the span.
 _OVERSAMPLING = 4

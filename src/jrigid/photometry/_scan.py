@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jrigid._numerics import product
 from jrigid._types import Vector
+from jrigid.photometry._curve_readings import EPOCHS, Readings, filled, orthonormal
 from jrigid.photometry._ellipsoid import lommel_seeliger_brightness
 from jrigid.photometry._model import (
     Task,
@@ -22,7 +23,6 @@ from jrigid.photometry._model import (
     geometry_of,
     unpacked,
 )
-from jrigid.photometry._readings import EPOCHS, Readings, filled, orthonormal
 
 POLES = 24
 ANGLES = 8

@@ -33,9 +33,17 @@ from jrigid.photometry._convex import (
     surface_of,
     unpacked_convex,
 )
+from jrigid.photometry._curve_readings import (
+    Readings,
+    follows,
+    noise_in_words,
+    readings_of,
+    stated_noise,
+)
+from jrigid.photometry._damit_files import LightCurve
 from jrigid.photometry._ellipsoid import Ellipsoid
-from jrigid.photometry._files import LightCurve
 from jrigid.photometry._inversion import in_degrees, in_hours
+from jrigid.photometry._many_starts import Quadratic, minimised
 from jrigid.photometry._model import (
     Numbers,
     Task,
@@ -46,14 +54,6 @@ from jrigid.photometry._model import (
     unpacked,
 )
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import (
-    Readings,
-    follows,
-    noise_in_words,
-    readings_of,
-    stated_noise,
-)
-from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin import (
     FIRST_NOISE,

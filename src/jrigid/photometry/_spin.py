@@ -27,14 +27,7 @@ from jrigid.photometry._convex import (
     surface_of,
     unpacked_convex,
 )
-from jrigid.photometry._ellipsoid import Ellipsoid
-from jrigid.photometry._facets import Facets
-from jrigid.photometry._files import LightCurve
-from jrigid.photometry._inversion import in_degrees, in_hours
-from jrigid.photometry._model import axes_of_momentum
-from jrigid.photometry._periodogram import check_span
-from jrigid.photometry._polyhedron import MOST_OPEN, mesh_from_facets
-from jrigid.photometry._readings import (
+from jrigid.photometry._curve_readings import (
     Readings,
     check_list,
     check_threshold,
@@ -44,6 +37,13 @@ from jrigid.photometry._readings import (
     readings_of,
     stated_noise,
 )
+from jrigid.photometry._damit_files import LightCurve
+from jrigid.photometry._ellipsoid import Ellipsoid
+from jrigid.photometry._facets import Facets
+from jrigid.photometry._inversion import in_degrees, in_hours
+from jrigid.photometry._model import axes_of_momentum
+from jrigid.photometry._periodogram import check_span
+from jrigid.photometry._polyhedron import MOST_OPEN, mesh_from_facets
 from jrigid.photometry._scattering import Mixture
 from jrigid.photometry._spin_search import (
     COARSE_DEGREE,

@@ -18,10 +18,10 @@ from jrigid.photometry._convex import (
     spin_quadratic,
     unpacked_convex,
 )
+from jrigid.photometry._curve_readings import Readings
+from jrigid.photometry._many_starts import Quadratic, minimised
 from jrigid.photometry._periodogram import shared_places
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import Readings
-from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scan import fewer_epochs
 
 # Chi-square has a minimum about every half turn within the span: half turns of an

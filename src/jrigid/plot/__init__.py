@@ -15,15 +15,15 @@ from jrigid.plot._animate import Animation as Animation
 from jrigid.plot._animate import animate as animate
 from jrigid.plot._animate import animate_light_curve as animate_light_curve
 from jrigid.plot._appearance import appearance as appearance
-from jrigid.plot._body import body as body
+from jrigid.plot._body_pictures import body as body
 from jrigid.plot._chart import chart as chart
-from jrigid.plot._fit import fit as fit
+from jrigid.plot._fit_pictures import fit as fit
 from jrigid.plot._free import herpolhode as herpolhode
 from jrigid.plot._free import polhode as polhode
 from jrigid.plot._light import light_curves as light_curves
 from jrigid.plot._light import period_map as period_map
-from jrigid.plot._motion import motion as motion
 from jrigid.plot._top import effective_potential as effective_potential
 from jrigid.plot._top import tip as tip
+from jrigid.plot._trajectory_pictures import motion as motion
 
 _list_public_names(__name__)

@@ -13,11 +13,11 @@ from jaxtyping import Array, ArrayLike, Float
 from jrigid._checks import check_option, check_shape, demand
 from jrigid._types import AnyArray
 from jrigid.photometry import Ellipsoid, Inversion, LightCurve, Tumbler
-from jrigid.plot import _common as common
+from jrigid.plot import _drawing as common
 from jrigid.plot._appearance import outline_of, sky_axes
-from jrigid.plot._body import Surface, place, surface_of
-from jrigid.plot._common import Axes3D, Body, Motion
-from jrigid.plot._tumbler import (
+from jrigid.plot._body_pictures import Surface, place, surface_of
+from jrigid.plot._drawing import Axes3D, Body, Motion
+from jrigid.plot._tumbler_pictures import (
     attitudes_at,
     between,
     magnitudes_at,

@@ -17,9 +17,9 @@ from jrigid.photometry import (
     Tumbler,
     mesh_from_facets,
 )
-from jrigid.plot._body import rings
-from jrigid.plot._common import Axes, Rotating, flat_axes, turned
-from jrigid.plot._tumbler import attitudes_at
+from jrigid.plot._body_pictures import rings
+from jrigid.plot._drawing import Axes, Rotating, flat_axes, turned
+from jrigid.plot._tumbler_pictures import attitudes_at
 
 Mesh: TypeAlias = tuple[AnyArray, AnyArray]
 

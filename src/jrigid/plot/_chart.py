@@ -8,7 +8,7 @@ import numpy as np
 from jrigid._checks import demand
 from jrigid._core.third_party import EnumerationItem, code_of, enumeration_of
 from jrigid._types import AnyArray
-from jrigid.plot._common import Axes, flat_axes
+from jrigid.plot._drawing import Axes, flat_axes
 from jrigid.sweep import SweepResult
 
 # Pale tints of Okabe and Ito's colours, on which black reads.

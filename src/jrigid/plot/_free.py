@@ -10,8 +10,8 @@ from jaxtyping import Array
 from jrigid._checks import check_option, check_shape, demand
 from jrigid._types import AnyArray
 from jrigid.free import free_rotation, mean_precession_rate, polhode_period
-from jrigid.plot import _common as common
-from jrigid.plot._common import (
+from jrigid.plot import _drawing as common
+from jrigid.plot._drawing import (
     LOOKS,
     TURN,
     Axes,

@@ -7,8 +7,8 @@ import numpy as np
 
 from jrigid._checks import check_option
 from jrigid.photometry import Alias, Inversion, LightCurve, PeriodPairs, Tumbler
-from jrigid.plot._common import LOOKS, Axes, flat_axes, label, looks, pyplot
-from jrigid.plot._tumbler import (
+from jrigid.plot._drawing import LOOKS, Axes, flat_axes, label, looks, pyplot
+from jrigid.plot._tumbler_pictures import (
     Model,
     Numbers,
     Points,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jrigid.plot import _common as common
-from jrigid.plot._common import Axes, Axes3D, Look, Motion
+from jrigid.plot import _drawing as common
+from jrigid.plot._drawing import Axes, Axes3D, Look, Motion
 from jrigid.top import SymmetricTop, conserved, nutation_bounds
 from jrigid.top import effective_potential as potential
 

@@ -7,12 +7,12 @@ from jrigid._public import list_public_names as _list_public_names
 from jrigid.records._clock import Clock as Clock
 from jrigid.records._clock import repair as repair
 from jrigid.records._flights import flights as flights
+from jrigid.records._found_in_records import Allan as Allan
+from jrigid.records._found_in_records import Noise as Noise
+from jrigid.records._found_in_records import Reading as Reading
+from jrigid.records._found_in_records import allan as allan
+from jrigid.records._found_in_records import noise as noise
+from jrigid.records._found_in_records import rests as rests
 from jrigid.records._read import read as read
-from jrigid.records._reading import Allan as Allan
-from jrigid.records._reading import Noise as Noise
-from jrigid.records._reading import Reading as Reading
-from jrigid.records._reading import allan as allan
-from jrigid.records._reading import noise as noise
-from jrigid.records._reading import rests as rests
 
 _list_public_names(__name__)

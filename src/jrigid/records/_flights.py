@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jrigid._checks import check_option
-from jrigid.records._reading import Reading, runs
+from jrigid.records._found_in_records import Reading, runs
 
 # Time over which a lever or a tensor is guessed [s], and how many guesses are tried.
 _WINDOW = 0.2

@@ -9,8 +9,8 @@ import numpy as np
 
 from jrigid._checks import check_option, demand
 from jrigid.records._clock import Clock, repair
-from jrigid.records._files import Source, Table, tables_of
-from jrigid.records._reading import Reading
+from jrigid.records._found_in_records import Reading
+from jrigid.records._tables import Source, Table, tables_of
 
 # By what is measured, in SI, spelled as `_plain` returns them.
 _UNITS: dict[str, dict[str, float]] = {

@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from jrigid._motion import depends_on
+from jrigid._motion_inputs import depends_on
 from jrigid._stepping.control import SMALLEST_BOUND
 from jrigid._stepping.engine import Engine
 from jrigid._stepping.motion import Motion

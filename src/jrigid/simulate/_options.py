@@ -16,7 +16,7 @@ from jrigid._checks import (
     kind_of,
     whole_number,
 )
-from jrigid._motion import numbers, solver_of
+from jrigid._motion_inputs import numbers, solver_of
 from jrigid._stepping.scales import spectral_radius, undamped_rate
 from jrigid._types import BodyState, ScalarLike
 from jrigid.solvers import ExactFree, Splitting, Verner9

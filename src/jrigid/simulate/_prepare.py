@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike
 
 from jrigid._checks import RESULTS, AnyBool, Findings, array_of_shape, harmless
 from jrigid._core.third_party import ClosedJaxpr, jaxpr_as_fun
-from jrigid._motion import check_motion, depends_on, harmless_motion, resolves
+from jrigid._motion_inputs import check_motion, depends_on, harmless_motion, resolves
 from jrigid._stepping.control import Limits, largest_steps
 from jrigid._stepping.derivatives import moved_in_a_step
 from jrigid._stepping.motion import Motion, constant

@@ -24,7 +24,7 @@ from jrigid._checks import (
     settle,
 )
 from jrigid._core.compile import floats_as_arrays, quick_jit
-from jrigid._motion import HasRigidBody, motion_arguments
+from jrigid._motion_inputs import HasRigidBody, motion_arguments
 from jrigid._numerics import unit_again
 from jrigid._stepping.derivatives import (
     moved_by,

@@ -5,7 +5,7 @@ from jaxtyping import Array, Bool
 from jrigid._core.compile import one_program
 from jrigid._types import Scalar, ScalarLike, VectorLike
 from jrigid.mass import MassProperties
-from jrigid.solids._common import MeanSquares, solid
+from jrigid.solids._mean_squares import MeanSquares, solid
 
 
 def _round(across: ScalarLike, along: ScalarLike) -> MeanSquares:

@@ -7,7 +7,7 @@ from jrigid._checks import all_finite, all_positive, shaped, where_defined
 from jrigid._core.compile import one_program
 from jrigid._types import Real, ScalarLike, VectorLike
 from jrigid.mass import MassProperties, inertia_tensor
-from jrigid.solids._common import MeanSquares, solid
+from jrigid.solids._mean_squares import MeanSquares, solid
 
 
 @one_program

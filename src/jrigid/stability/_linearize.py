@@ -18,7 +18,7 @@ from jrigid._checks import (
     shaped,
 )
 from jrigid._core.compile import quick_jit
-from jrigid._motion import harmless_motion
+from jrigid._motion_inputs import harmless_motion
 from jrigid._numerics import safe_norm
 from jrigid._stepping.scales import spread
 from jrigid._types import Readable, Scalar, ScalarLike, VectorLike

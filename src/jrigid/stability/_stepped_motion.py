@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from jrigid._checks import RESULTS, Findings, all_finite, all_positive, nan_where
 from jrigid._core.compile import floats_as_arrays
-from jrigid._motion import (
+from jrigid._motion_inputs import (
     check_motion,
     harmless_motion,
     motion_arguments,

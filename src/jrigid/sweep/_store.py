@@ -27,7 +27,7 @@ import numpy as np
 from jrigid._core.third_party import ClosedJaxpr, Jaxpr, Literal
 from jrigid._extra import extra
 from jrigid.sweep._grid import VALID, Grid, Leaf
-from jrigid.sweep._result import Failure
+from jrigid.sweep._sweep_result import Failure
 
 try:
     import fcntl

@@ -17,9 +17,9 @@ from jaxtyping import ArrayLike, PyTree
 from jrigid._checks import check_type, demand, kind_of, whole_number
 from jrigid.sweep._drive import Submit, meter, outcomes
 from jrigid.sweep._grid import Grid, Leaf, grid_of, leaves_of
-from jrigid.sweep._refine import Classes, RefinedMap, corners_of
-from jrigid.sweep._result import Failure, SweepResult
+from jrigid.sweep._refined_maps import Classes, RefinedMap, corners_of
 from jrigid.sweep._store import Memory, Store, identity, known_block
+from jrigid.sweep._sweep_result import Failure, SweepResult
 from jrigid.sweep._work import (
     Call,
     Outcome,

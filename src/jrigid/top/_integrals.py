@@ -17,7 +17,7 @@ from jrigid._checks import (
     where_defined,
 )
 from jrigid._core.compile import one_program
-from jrigid._motion import HasRigidBody, plain_state
+from jrigid._motion_inputs import HasRigidBody, plain_state
 from jrigid._numerics import product, safe_norm
 from jrigid._types import Scalar
 from jrigid.dynamics import State, angular_momentum, kinetic_energy

@@ -17,7 +17,7 @@ from jrigid._checks import (
     shaped,
     where_defined,
 )
-from jrigid._motion import plain_state
+from jrigid._motion_inputs import plain_state
 from jrigid._types import Readable, ScalarLike, VectorLike
 from jrigid.dynamics import State
 from jrigid.mass import MassProperties

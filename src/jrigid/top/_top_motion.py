@@ -5,7 +5,7 @@ import jax.tree_util as jtu
 from jaxtyping import ArrayLike
 
 from jrigid._checks import RESULTS, Findings, check_type
-from jrigid._motion import exact_motion, plain_state
+from jrigid._motion_inputs import exact_motion, plain_state
 from jrigid._types import Quaternion, Real, Scalar, ScalarLike, Vector
 from jrigid.dynamics import ExactStates, State
 from jrigid.top._lame_solution import invariants, state_after

@@ -1,4 +1,4 @@
-"""A reading, and what is found in it: rests, and the noise of the gyro at rest."""
+"""What is found in a record: rests, and the noise of the gyro at rest."""
 
 import itertools
 from typing import NamedTuple

@@ -8,7 +8,7 @@ import numpy as np
 
 from jrigid._checks import check_option, check_type
 from jrigid.identify import FitResult
-from jrigid.plot._common import LOOKS, TURN, Axes, label, looks, pyplot
+from jrigid.plot._drawing import LOOKS, TURN, Axes, label, looks, pyplot
 
 _LAYOUT = [
     ["record"] * 3,

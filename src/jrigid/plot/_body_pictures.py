@@ -8,8 +8,8 @@ from jrigid._checks import check_option, demand, kind_of
 from jrigid._types import AnyArray
 from jrigid.dynamics import State
 from jrigid.mass import from_mesh
-from jrigid.plot import _common as common
-from jrigid.plot._common import Axes3D, Body
+from jrigid.plot import _drawing as common
+from jrigid.plot._drawing import Axes3D, Body
 from jrigid.top import SymmetricTop
 
 _LIGHT = np.array([0.36, 0.48, 0.8])  # where it comes from

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float
 
 from jrigid._checks import demand
 from jrigid._types import Readable, Real
-from jrigid.photometry._files import ASTRONOMICAL_UNIT
+from jrigid.photometry._damit_files import ASTRONOMICAL_UNIT
 
 SPEED_OF_LIGHT = 299792458.0  # m / s
 # Of the Sun [m^3 / s^2], JPL's ephemeris DE440.

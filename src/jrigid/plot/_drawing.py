@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from jrigid._checks import INERTIA, demand, kind_of
 from jrigid._extra import extra
-from jrigid._motion import HasRigidBody
+from jrigid._motion_inputs import HasRigidBody
 from jrigid._numerics import as_tensor
 from jrigid._types import AnyArray
 from jrigid.dynamics import State

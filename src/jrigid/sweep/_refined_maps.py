@@ -13,8 +13,8 @@ from jaxtyping import PyTree
 from jrigid._checks import traced_by_jax
 from jrigid._core.third_party import EnumerationItem, enumeration_of, names_of
 from jrigid.sweep._grid import Grid
-from jrigid.sweep._result import Failure, SweepResult
 from jrigid.sweep._store import Memory, Store
+from jrigid.sweep._sweep_result import Failure, SweepResult
 
 
 def corners_of(grid: Grid) -> dict[str, np.ndarray]:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jrigid._checks import check_option, check_shape, demand
-from jrigid._motion import HasRigidBody
+from jrigid._motion_inputs import HasRigidBody
 from jrigid._types import AnyArray, VectorLike
-from jrigid.plot._common import (
+from jrigid.plot._drawing import (
     Axes,
     Motion,
     label,

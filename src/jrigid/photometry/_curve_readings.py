@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jrigid._checks import demand
 from jrigid._numerics import product
 from jrigid._types import AnyArray
-from jrigid.photometry._files import LightCurve
+from jrigid.photometry._damit_files import LightCurve
 
 # Natural logarithm of the brightness in one magnitude.
 MAGNITUDE = 0.4 * np.log(10.0)

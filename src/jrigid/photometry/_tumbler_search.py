@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from jrigid._checks import demand
 from jrigid._core.host_rows import in_batches, joined, rows_of
+from jrigid.photometry._curve_readings import Readings
+from jrigid.photometry._many_starts import Quadratic, minimised
 from jrigid.photometry._model import (
     COUNT,
     Mode,
@@ -23,8 +25,6 @@ from jrigid.photometry._model import (
 )
 from jrigid.photometry._periodogram import frequency_pairs, strongest_lines, unlike
 from jrigid.photometry._pole import direction_of_pole
-from jrigid.photometry._readings import Readings
-from jrigid.photometry._refine import Quadratic, minimised
 from jrigid.photometry._scan import (
     ANGLES,
     fewer_epochs,
