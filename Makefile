@@ -4,7 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 CONSTRAINTS ?= constraints.txt
 INSTALL = $(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS)
-SOURCES := src tests benchmarks examples docs/conf.py docs/_site.py
+SOURCES := src tests benchmarks examples conftest.py docs/conf.py docs/_site.py \
+  docs/names.py notebooks/execute.py
 export MPLBACKEND := Agg
 
 .PHONY: demo test lint types doctest bench notebooks docs slow clean

@@ -103,10 +103,10 @@ def curves(lanes):
 
 
 def scan(motions):
-    """Chi-square of many starting points: motions times orientations."""
+    """Chi-square of many starting points: motions times attitudes."""
     numbers, tasks = starting_points(motions)
     few = _scan.fewer_epochs(readings())
-    turned = _scan.orientations()
+    turned = _scan.attitudes()
     first, least, _ = bench_lanes.seconds(_scan.scanned, numbers, tasks, turned, few)
     many = motions * len(turned)
     name = f"scan of starting points, {_curve_readings.EPOCHS} epochs: {many:,}"

@@ -8,7 +8,7 @@ scipy, all at 1e-9 of the angle turned or better. Times are minimum and median i
 milliseconds, without compilation. Derivatives are those in the three rates; for DOP853
 they are four curves, as a difference quotient needs.
 
-A search for tumblers scans 100,032 starting points: 521 motions in 192 orientations each,
+A search for tumblers scans 100,032 starting points: 521 motions in 192 attitudes each,
 at 128 epochs. Its time is measured. That of the same scan by integration is 521 times one
 motion, without the brightness.
 """
@@ -162,7 +162,7 @@ def scan():
     numbers, tasks = bench_device.starting_points(MOTIONS)
     few = _scan.fewer_epochs(bench_device.readings())
     few = few._replace(ts=few.ts * (9 * YEAR / few.span), span=np.asarray(9 * YEAR))
-    turned = _scan.orientations()
+    turned = _scan.attitudes_tried()
     program = _scan.scanned
     _, least, _ = bench_lanes.seconds(program, numbers, tasks, turned, few)
     return least, MOTIONS * len(turned)

@@ -303,7 +303,7 @@ def fit_sysid(
         evaluations += 1 if x.ndim == 1 else x.shape[1]
         return function(x, parameters)
 
-    # Its optimizer prints each iteration and cannot be told not to.
+    # Its optimizer prints each iteration and cannot be asked not to.
     with contextlib.redirect_stdout(io.StringIO()):
         x = np.ravel(optimize(unknowns, counted, verbose=False, max_iters=200)[1].x)
     final = np.concatenate([np.ravel(r) for r in function(x, unknowns)[0]])

@@ -87,7 +87,7 @@ def directive(module: str, name: str) -> str:
 
 
 def skip_numbered_fields(app, what, name, thing, skip, options):
-    """Fields of named tuples are told by their class."""
+    """Fields of named tuples are described by their class."""
     return True if type(thing).__name__ == "_tuplegetter" else None
 
 

@@ -83,7 +83,7 @@ def draw(found: jr.SweepResult) -> None:
     axes.set(
         xlabel="width / length",
         ylabel="thickness / width",
-        title="A box thrown about its middle axis, one degree off",
+        title="A box thrown about its intermediate axis, one degree off",
     )
     figure.savefig(PICTURE, dpi=150)
 

@@ -100,12 +100,12 @@ class Chromium:
 
     def evaluate(self, script):
         """The value of an expression of JavaScript, a promise awaited."""
-        told = self(
+        answer = self(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
-        if "exceptionDetails" in told:
-            raise RuntimeError(told["exceptionDetails"])
-        return told["result"].get("value")
+        if "exceptionDetails" in answer:
+            raise RuntimeError(answer["exceptionDetails"])
+        return answer["result"].get("value")
 
     def complaints(self):
         """Errors of scripts and of loading since the page was opened."""

@@ -27,7 +27,7 @@ rotation. Else the sign of
 without rounding from the doubles given, says which formula applies: with a the axis of
 the smallest moment and c that of the largest, D > 0 circles c, D < 0 circles a (their
 names then change places), and D = 0 is the exact separatrix: sech and tanh, and phi' =
-L / I_b about the middle axis.
+L / I_b about the intermediate axis.
 
 Every other quantity is a sum of terms of one sign or is bounded away from cancellation
 by D, and carries 60 digits and two more for each decade by which D, or 1 - m, is small.
@@ -203,8 +203,8 @@ def _separatrix(moments, w, times):
     """As `_generic`, exactly on the separatrix; the third axis is that of the middle
     moment.
 
-    The components across the middle axis go as sech u with a constant ratio, so psi is
-    constant; 2 E = L^2 / I_b makes phi' = L / I_b.
+    The components across the intermediate axis go as sech u with a constant ratio, so
+    psi is constant; 2 E = L^2 / I_b makes phi' = L / I_b.
     """
     momentum = [i * x for i, x in zip(moments, w, strict=True)]
     across = mp.hypot(momentum[0], momentum[1])

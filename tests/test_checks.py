@@ -1,4 +1,4 @@
-"""The door: what is wrong is raised by name, with the value and the lane, or marked."""
+"""Input validation: errors name the argument, its value and the lane, or mark it."""
 
 import diffrax
 import equinox as eqx

@@ -115,9 +115,9 @@ def test_cross_validation_prefers_no_torque_where_there_is_none(rng):
 @pytest.mark.slow  # programs of its own
 def test_a_trial_left_out_is_judged_by_the_fit_s_own_model(rng):
     kicked = trials(rng, count=3)
-    spoilt = [identify.Rates(x.ts, x.values.at[40].add(1.0), x.sigma) for x in kicked]
+    kinked = [identify.Rates(x.ts, x.values.at[40].add(1.0), x.sigma) for x in kicked]
     robust = lambda x: identify.fit(BLIND, x, loss="robust", throw=False)  # noqa: E731
-    squares = identify.cross_validate(robust, spoilt)
+    squares = identify.cross_validate(robust, kinked)
     assert np.all((squares > 0.7 * 237) & (squares < 1.3 * 237)), squares
     with pytest.raises(ValueError, match="must state the noise"):
         identify.cross_validate(

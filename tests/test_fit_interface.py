@@ -136,9 +136,9 @@ def test_a_prediction_has_the_sensors_memory_and_the_torque(found, rng):
     )
     body = jr.RigidBody(found.inertia, jr.torques.QuadraticDrag(drag * jnp.ones(3)))
     star = identify.AttitudeSensor()
-    told = with_parts(found, body, star, gyro, omegas=omegas, t0=(0.0, start))
+    fitted = with_parts(found, body, star, gyro, omegas=omegas, t0=(0.0, start))
     ts = start + np.array([2.4, 0.3, 4.1, 1.2])  # in any order
-    shown = told.predict(ts, record=1, trial=1)
+    shown = fitted.predict(ts, record=1, trial=1)
     grid = np.arange(0, 5, 0.001)
     air, tensor = worlds.quadratic_drag(drag), np.asarray(found.inertia)
     motion = worlds.tumble(tensor, omegas[1], grid, air)
@@ -155,14 +155,14 @@ def test_a_prediction_has_the_sensors_memory_and_the_torque(found, rng):
     )
     assert np.max(np.abs(true)) == limit
     np.testing.assert_allclose(shown[order], true, atol=1e-4)
-    assert np.abs(told.predict(ts, record=1, trial=0) - shown).max() > 0.1
-    turned = told.predict(ts[order], trial=1)
+    assert np.abs(fitted.predict(ts, record=1, trial=0) - shown).max() > 0.1
+    turned = fitted.predict(ts[order], trial=1)
     times, upright = np.append(0, ts[order] - start), np.array([1.0, 0, 0, 0])
     true = worlds.tumble(tensor, omegas[1], times, air, attitude0=upright).attitude[1:]
     side = np.sign(np.sum(turned * true, axis=1, keepdims=True))
     np.testing.assert_allclose(side * turned, true, atol=1e-6)
     with pytest.raises(ValueError, match="`ts` must not be before the trial's `t0`"):
-        told.predict(2.9, record=1, trial=1)
+        fitted.predict(2.9, record=1, trial=1)
 
 
 # Shares
@@ -246,11 +246,11 @@ def spin(_, state, __):
 
 
 def test_functions_are_kept_by_their_names(found, tmp_path):
-    def told(function):
+    def fitted(function):
         return with_parts(found, BLIND, identify.FunctionSensor(function))
 
     path = tmp_path / "fit.pkl"
-    named = told(spin)
+    named = fitted(spin)
     identify.save(path, named)
     again = identify.load(path)
     assert again.fitted()[1].function is spin
@@ -258,7 +258,7 @@ def test_functions_are_kept_by_their_names(found, tmp_path):
     with pytest.raises(
         ValueError, match=r"Argument `result` must hold functions .*lambda"
     ):
-        identify.save(path, told(lambda _, state, __: state.omega[2:]))
+        identify.save(path, fitted(lambda _, state, __: state.omega[2:]))
     path.write_bytes(path.read_bytes().replace(b"spin", b"spun"))
     with pytest.raises(ValueError, match=r"Argument `path` must be a file .*spun"):
         identify.load(path)
@@ -421,14 +421,14 @@ def test_a_record_with_unmodelled_torque_is_drawn_as_it_was_followed(
 
 
 def test_attitudes_are_drawn_on_the_models_side(found, pictures):
-    told = with_parts(found, BLIND, identify.AttitudeSensor())
+    fitted = with_parts(found, BLIND, identify.AttitudeSensor())
     ax = pictures.figure().add_subplot()
 
     def drawn(values):
-        samples = told.problem.samples._replace(values=(jnp.asarray(values)[None],))
-        problem = dataclasses.replace(told.problem, samples=samples)
+        samples = fitted.problem.samples._replace(values=(jnp.asarray(values)[None],))
+        problem = dataclasses.replace(fitted.problem, samples=samples)
         ax.clear()
-        jr.plot.fit(dataclasses.replace(told, problem=problem), {"record": ax})
+        jr.plot.fit(dataclasses.replace(fitted, problem=problem), {"record": ax})
         return ax.lines
 
     model = drawn(np.ones((TS.size, 4)))[::3]

@@ -50,7 +50,7 @@ def _difference(moments, attitude, omega, time, bits=160):
         "near separatrix",
         "symmetric",
         "nearly sphere",
-        "near the middle axis",
+        "near the intermediate axis",
     ],
 )
 def test_closed_form_against_taylor_series(moments, omega, time):

@@ -1,4 +1,4 @@
-"""The house stays in order: doors, borders, what of other packages is used."""
+"""The house stays in order: facades, borders, what of other packages is used."""
 
 import ast
 from graphlib import TopologicalSorter

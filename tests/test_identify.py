@@ -287,7 +287,7 @@ def test_samples_that_are_missing_are_left_out(free_samples, wheel_samples, rng)
 
 
 def test_what_the_samples_do_not_tell_shows_in_the_singular_values():
-    """Pure spin: ratios are not told; the unit of time and of the rates changes nothing."""
+    """Pure spin: ratios are not determined; the unit of time and of the rates changes nothing."""
     spin = np.tile([0.0, 0.0, 1.3], (len(TS), 1))
     values = np.asarray(identify.weak_form(TS, spin).singular_values)
     assert np.sum(values > 1e-6 * values[0]) <= 3

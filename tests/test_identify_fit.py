@@ -138,9 +138,9 @@ def test_a_bad_lane_is_marked_and_leaves_the_others_alone(blind_fit, rng):
     _, omegas, _ = rates(ASYMMETRIC)
     records = np.tile(omegas + 0.01 * rng.normal(size=omegas.shape), (60, 1, 1))
     alone = blind_fit(records, 0.01)
-    spoilt = records.copy()  # the first call may still be reading
-    spoilt[1] = np.nan
-    found = blind_fit(spoilt, 0.01)
+    disturbed = records.copy()  # the first call may still be reading
+    disturbed[1] = np.nan
+    found = blind_fit(disturbed, 0.01)
     assert bool((found.status == Status.BAD_INPUT)[1])
     assert np.all(np.isnan(found.inertia[1]))
     assert "60 fits: 59 OK, 1 BAD_INPUT" in str(found)
@@ -287,7 +287,7 @@ def bound(tensor, omega, ts, t0):
     return jax.value_and_grad(variance, argnums=(0, 1), has_aux=True)(omega, ts)
 
 
-def told_and_information(tensor, omega, ts, sigma, t0):
+def fitted_and_information(tensor, omega, ts, sigma, t0):
     start, record = jr.State(UNTURNED, omega), identify.Rates(ts, None, sigma)
     plan = identify.Plan(jr.RigidBody(tensor), start, record, t0=t0)
     return plan.predicted, plan.information
@@ -322,7 +322,7 @@ def test_a_record_that_starts_late_has_its_state_at_its_own_t0(one_fit):
     for state, at in ((state0, t0), (at_zero, np.zeros(()))):
         (_, covariance), _ = bound(found.inertia, state.omega, ts, at)
         np.testing.assert_allclose(covariance, found.ratios_covariance, rtol=1e-3)
-        stated = told_and_information(found.inertia, state.omega, ts, 0.02, at)[0].t0
+        stated = fitted_and_information(found.inertia, state.omega, ts, 0.02, at)[0].t0
         np.testing.assert_array_equal(stated, at)
 
 
@@ -387,11 +387,11 @@ def test_bound_of_a_plan_is_the_error_of_the_fit_and_has_its_derivatives(one_fit
 
     (least, _), (slope_omega, slope_ts) = bound(tensor, omega, TS, np.zeros(()))
     assert float(least) == pytest.approx(float(found.ratios_covariance[1, 1]), rel=0.1)
-    told, information = told_and_information(tensor, omega, TS, 0.02, np.zeros(()))
-    assert bool(told.status == Status.OK)
-    np.testing.assert_allclose(told.ratios_covariance[1, 1], least, rtol=1e-4)
+    fitted, information = fitted_and_information(tensor, omega, TS, 0.02, np.zeros(()))
+    assert bool(fitted.status == Status.OK)
+    np.testing.assert_allclose(fitted.ratios_covariance[1, 1], least, rtol=1e-4)
     inverse = np.linalg.inv(np.asarray(information))
-    np.testing.assert_allclose(inverse, told.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(inverse, fitted.covariance, rtol=1e-6, atol=1e-12)
     for k in range(3):
         h = 1e-5 * np.eye(3)[k]
         difference = (variance(omega + h, TS) - variance(omega - h, TS)) / 2e-5
@@ -413,7 +413,7 @@ def picked(gyro, name, sigma):
 def program(name=None, prior=None, factors=None):
     """Compiled once for each error of the gyro that is sought."""
     if name is None:
-        return lambda tensor, omega: told_and_information(
+        return lambda tensor, omega: fitted_and_information(
             tensor, omega, TS, 0.01, np.zeros(())
         )[0]
     gyro = identify.Gyro(scale=np.ones(factors) if factors else 1.0)
@@ -426,7 +426,7 @@ def program(name=None, prior=None, factors=None):
     )
 
 
-def told(body, name=None, prior=None, factors=None, axes=TURN):
+def planned(body, name=None, prior=None, factors=None, axes=TURN):
     moments, direction = body
     tensor = axes @ np.diag(moments) @ axes.T
     omega = axes @ np.array(direction) / np.linalg.norm(direction)
@@ -434,7 +434,7 @@ def told(body, name=None, prior=None, factors=None, axes=TURN):
 
 
 def test_free_motion_tells_everything_but_the_scale():
-    found = told(ASYMMETRIC)
+    found = planned(ASYMMETRIC)
     assert found.null_directions == ("overall scale",)
     assert bool(found.status == Status.OK)
     plan = identify.Attitudes(TS, None, 0.01)
@@ -445,7 +445,7 @@ def test_free_motion_tells_everything_but_the_scale():
 
 
 def test_many_fits_name_their_numbers_once_and_other_methods_ask_for_one_fit():
-    one = told(ASYMMETRIC, "bias")
+    one = planned(ASYMMETRIC, "bias")
     both = jax.tree.map(lambda x: jnp.stack([x, x]), one)
     assert both.names == one.names
     assert one.names[5:] == ("gyro.bias[0]", "gyro.bias[1]", "gyro.bias[2]")
@@ -470,7 +470,7 @@ def test_many_fits_name_their_numbers_once_and_other_methods_ask_for_one_fit():
 
 def test_trials_records_levels_and_functions_that_are_none_are_refused(untyped):
     """JAX would read the last trial in the place of one that there is not."""
-    one = told(ASYMMETRIC, "bias")
+    one = planned(ASYMMETRIC, "bias")
     for ask in (one.fitted, one.initial_state):
         for index in (1, -1):
             with pytest.raises(ValueError, match="`index` must be at least 0"):
@@ -499,7 +499,7 @@ def test_the_scale_of_a_free_body_is_refused(scale):
     "body", [((1, 1.7, 2.3), (0, 0, 1)), ((1, 1, 1), (0.5, 1, 0.4))]
 )
 def test_pure_spin_and_a_sphere_do_not_tell_ratios(body, rng):
-    words = told(body).null_directions
+    words = planned(body).null_directions
     assert "spin is pure: ratios not determined" in words
     _, omegas, _ = rates(body)
     for _ in range(5):
@@ -515,9 +515,9 @@ def test_pure_spin_and_a_sphere_do_not_tell_ratios(body, rng):
 
 
 def test_bias_of_the_gyro():
-    found = told(ASYMMETRIC, "bias")
+    found = planned(ASYMMETRIC, "bias")
     assert found.null_directions == ("overall scale",)
-    found = told(SYMMETRIC, "bias")
+    found = planned(SYMMETRIC, "bias")
     assert bool(found.status == Status.UNIDENTIFIABLE)
     (text,) = found.null_directions[1:]
     assert "I3/I1" in text
@@ -525,8 +525,8 @@ def test_bias_of_the_gyro():
 
 
 def test_one_scale_factor_of_the_gyro():
-    assert told(ASYMMETRIC, "scale").null_directions == ("overall scale",)
-    (text,) = told(SYMMETRIC, "scale").null_directions[1:]
+    assert planned(ASYMMETRIC, "scale").null_directions == ("overall scale",)
+    (text,) = planned(SYMMETRIC, "scale").null_directions[1:]
     assert "gyro scale" in text
     assert "I3/I1" in text
 
@@ -534,10 +534,10 @@ def test_one_scale_factor_of_the_gyro():
 @pytest.mark.slow  # two programs of their own
 def test_three_scale_factors_or_a_whole_matrix_of_the_gyro():
     """Three factors along principal axes change (I2 - I3)/I1 and cyclic ones at will."""
-    words = told(ASYMMETRIC, "scale", factors=3, axes=np.eye(3)).null_directions
+    words = planned(ASYMMETRIC, "scale", factors=3, axes=np.eye(3)).null_directions
     assert len(words) > 1
     assert all("gyro scale" in text for text in words[1:])
-    words = told(ASYMMETRIC, "matrix").null_directions
+    words = planned(ASYMMETRIC, "matrix").null_directions
     assert len(words) > 1
     assert all("gyro matrix" in text for text in words[1:])
 
@@ -546,18 +546,18 @@ def test_bias_and_scale_inflate_the_bound_as_measured_before():
     """Factors of 1.6 and 2.7 (asymmetric) to 60 and 160 for I = (1, 1.02, 1.5)."""
     for body, least in ((ASYMMETRIC, 1.2), (BODIES["nearly symmetric"], 10.0)):
         plain, bias, factor = (
-            float(told(body, n).ratios_errors[1]) for n in (None, "bias", "scale")
+            float(planned(body, n).ratios_errors[1]) for n in (None, "bias", "scale")
         )
         assert bias > least * plain
         assert factor > least * plain
     # What is known beforehand of the bias helps
-    known = told(BODIES["nearly symmetric"], "bias", 1e-4)
+    known = planned(BODIES["nearly symmetric"], "bias", 1e-4)
     assert float(known.ratios_errors[1]) < 3 * plain
 
 
 def test_a_gyro_of_unknown_handedness_fits_two_bodies():
     _, omegas, _ = rates(ASYMMETRIC)
-    found = told(ASYMMETRIC)
+    found = planned(ASYMMETRIC)
     assert (
         "with one axis of the gyro reversed the same record is that of a body"
         in str(found)
@@ -901,7 +901,7 @@ def test_ten_numbers_of_a_body_about_its_pivot_of_which_two_are_known(rng):
 
 @pytest.mark.slow  # a minute of compiling
 def test_ten_numbers_are_two_too_many():
-    """The mass, and the scale of the inertia and the weight's moment, are not told."""
+    """The mass, and the scale of the inertia and the weight's moment, are not determined."""
     arm = jr.solids.box(2.0, np.array([0.2, 0.3, 0.5])).translated(
         np.array([0.05, -0.02, 0.4])
     )
@@ -937,7 +937,7 @@ def test_degrees_for_radians_are_suspected_where_the_body_seems_a_sphere(rng):
 
 
 def trials_of_a_phone(rng, count, drags):
-    """Rates at 100 Hz of trials of 0.5 to 1.5 s; spoilt samples, spoilt trials."""
+    """Rates at 100 Hz of trials of 0.5 to 1.5 s; bad samples, bad trials."""
     box = jr.solids.box(0.17, np.array([0.0715, 0.147, 0.0078]))
     moments = np.asarray(jnp.diagonal(box.inertia))
     turn = Rotation.from_rotvec(np.radians([1.5, -1.0, 0.8])).as_matrix()
@@ -963,8 +963,10 @@ def trials_of_a_phone(rng, count, drags):
     values = np.asarray(motion(spin)) + 0.02 * rng.normal(size=(count, 151, 3))
     touched = rng.random((count, 151)) < 0.02
     values[touched] += 2 * rng.normal(size=(touched.sum(), 3))
-    spoilt = np.sort(rng.choice(count, max(1, count // 20), replace=False))
-    values[spoilt] += np.cumsum(0.15 * rng.normal(size=(spoilt.size, 151, 3)), axis=1)
+    disturbed = np.sort(rng.choice(count, max(1, count // 20), replace=False))
+    values[disturbed] += np.cumsum(
+        0.15 * rng.normal(size=(disturbed.size, 151, 3)), axis=1
+    )
     lengths = rng.integers(50, 152, count)
     trials = [
         identify.Rates(ts[:n], y[:n], 0.02)
@@ -972,16 +974,16 @@ def trials_of_a_phone(rng, count, drags):
     ]
     torque = jr.torques.QuadraticDrag(0.005 * moments) if drags else None
     start = jr.RigidBody(np.full(3, moments.mean()), torque)
-    return moments, drag, spoilt, trials, start
+    return moments, drag, disturbed, trials, start
 
 
 def check_phone(rng, count, drags):
-    moments, drag, spoilt, trials, start = trials_of_a_phone(rng, count, drags)
+    moments, drag, disturbed, trials, start = trials_of_a_phone(rng, count, drags)
     free = (lambda body: body.torque.coefficient) if drags else None
     found = identify.fit(start, trials, loss="robust", free=free)
     assert bool(found.status == Status.OK)
-    assert list(np.flatnonzero(np.asarray(found.rejected_trials))) == list(spoilt)
-    assert "trials left out: " + ", ".join(str(i) for i in spoilt) in str(found)
+    assert list(np.flatnonzero(np.asarray(found.rejected_trials))) == list(disturbed)
+    assert "trials left out: " + ", ".join(str(i) for i in disturbed) in str(found)
     true = np.sort(moments)[1:] / moments.min()
     errors = np.asarray(found.ratios_errors)
     assert np.all(np.abs(np.asarray(found.ratios) - true) < 4 * errors)

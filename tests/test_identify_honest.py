@@ -112,7 +112,7 @@ def short_fit(ts, values, sigma):
 
 @pytest.mark.slow  # many fits
 def test_prolate_bodies_about_equatorial_axes_are_never_ok_and_wrong(rng):
-    """Their rate along the axis is hardly told, and so is not the ratio."""
+    """Their rate along the axis is hardly determined, and so is not the ratio."""
     ts, wrong = np.arange(60.0), []
     for i in range(100):
         ratio, tilt = np.exp(rng.uniform([0.3, -9.0], [3.0, -2.0]))
@@ -247,8 +247,8 @@ def test_a_prolate_body_about_an_equatorial_axis_for_230_turns(rng):
         if is_in(found, (Status.OK,)):
             covers(found, tensor)
         else:  # or creeps along the valley
-            told = (Status.UNIDENTIFIABLE, Status.AT_BOUNDARY, Status.NOT_CONVERGED)
-            assert is_in(found, told), words(found)
+            expected = (Status.UNIDENTIFIABLE, Status.AT_BOUNDARY, Status.NOT_CONVERGED)
+            assert is_in(found, expected), words(found)
 
 
 def test_a_reversed_axis_of_the_gyro_is_that_of_the_mirror_body_which_is_named(rng):
@@ -426,7 +426,7 @@ def test_many_attitudes_of_swapped_markers_are_left_out(rng):
 
 @pytest.mark.parametrize(("share", "size"), [(0.05, 300.0), (0.05, 1e6), (0.2, 1.0)])
 def test_robust_fits_find_their_way_past_any_outliers(rng, share, size):
-    """They are judged by what is left: its size is that of the noise."""
+    """They are judged by their residuals: their size is that of the noise."""
     for _ in range(4):
         tensor = body_of(rng)
         _, values = seen(rng, tensor, sigma=0.02)
@@ -945,13 +945,13 @@ def test_a_wheel_as_each_trial_recorded_it(sought, rng):
     scale, delay = (1.01, 0.005) if sought else (1.0, 0.0)
     systems, records = [], []
     for i in range(3):
-        true, told = worlds.wheel_profile(
+        true, predicted = worlds.wheel_profile(
             rng.normal(size=3), 1.5, 0.1 + 0.1 * i, 0.6, scale, delay
         )
         moved = worlds.tumble(tensor, spin_of(rng, tensor, spin), ts, wheel=true)
         values = moved.omega + sigma * rng.normal(size=moved.omega.shape)
         clock = np.arange(61 + i) * 0.02  # of another length in each trial
-        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, told(clock)[0]))
+        wheel = jr.torques.Rotor(jr.torques.Sampled(clock, predicted(clock)[0]))
         systems.append(jr.RigidBody(np.ones(3), wheel))
         records.append(identify.Rates(ts, values, sigma))
     free = None

@@ -253,7 +253,7 @@ def test_noise_about_a_constant_rate_is_no_swing(rng):
 
 @pytest.mark.parametrize("rates", [[0.0, 2.0, 0.0], [0.3, 2.0, 1.0]])
 def test_constant_rates_without_a_noise_tell_no_ratios(rates):
-    """What is left is rounding, which is no noise to take errors from."""
+    """The residuals are rounding, which is no noise to take errors from."""
     ts = np.arange(100) * 0.1
     found = identify.fit(
         BLIND, identify.Rates(ts, np.tile(rates, (100, 1))), throw=False

@@ -84,7 +84,7 @@ def test_names_tell_session_and_axis(worlds_found):
 
 
 @pytest.mark.parametrize(
-    ("groups", "told"),
+    ("groups", "message"),
     [
         ([0, 1], "Argument `groups` of `each` must number the groups of 9 trials"),
         ([0] * 8 + [2], "Argument `groups` of `each` must number the groups"),
@@ -92,8 +92,8 @@ def test_names_tell_session_and_axis(worlds_found):
         ([0] * 8 + [-2], "Argument `groups` must be an integer and at least -1"),
     ],
 )
-def test_groups_that_are_none_are_an_error(groups, told, rng):
-    with pytest.raises(ValueError, match=told):
+def test_groups_that_are_none_are_an_error(groups, message, rng):
+    with pytest.raises(ValueError, match=message):
         identify.fit(
             BLIND,
             trials(rng, np.zeros((2, 3))),

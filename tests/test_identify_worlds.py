@@ -153,12 +153,12 @@ def trials_with_a_wheel(rng, count, scale=1.0, delay=0.0):
     records, bodies = [], []
     for i, spin in enumerate(spins):
         axis = np.array([0.0, 0.6, 0.8])
-        true, told = worlds.wheel_profile(
+        true, predicted = worlds.wheel_profile(
             axis, 2.1e-3, 0.05, 0.3 + 0.05 * i, scale, delay
         )
         motion = worlds.tumble(WHEEL_TENSOR, spin, ts, wheel=true)
         values = motion.omega + sigma * rng.normal(size=motion.omega.shape)
-        momenta = np.array([told(t)[0] for t in ts])
+        momenta = np.array([predicted(t)[0] for t in ts])
         records.append(identify.Rates(ts, values, sigma))
         bodies.append(
             jr.RigidBody(np.ones(3), jr.torques.Rotor(jr.torques.Sampled(ts, momenta)))
@@ -299,5 +299,5 @@ def test_the_log_density_has_the_fit_s_minimum_and_curvature(rng):
     record = identify.Rates(TS, values, 1e-4)
     start = jr.State(np.array([1.0, 0, 0, 0]), OMEGA)
     smoothed = identify.Plan(jr.RigidBody(TENSOR), start, record).predicted
-    told = identify.log_density(smoothed)  # a plan has a density too
-    assert told.start.shape == (8,)
+    density = identify.log_density(smoothed)  # a plan has a density too
+    assert density.start.shape == (8,)

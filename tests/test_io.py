@@ -1,4 +1,4 @@
-"""Doors: every convention against the package itself, not against ourselves."""
+"""Interoperability: every convention is checked against the other package itself."""
 
 import importlib
 import os
@@ -61,7 +61,7 @@ def test_scipys_rigid_transforms(rng):
     assert_allclose(position, place)
 
 
-def test_what_is_no_rotation_is_told_so():
+def test_what_is_no_rotation_is_refused():
     with pytest.raises(
         ValueError, match=r"must be a scipy.*RigidTransform, but it is a int"
     ):
@@ -92,16 +92,16 @@ def test_jaxlie_turns_vectors_as_attitudes_do(rng):
     assert_allclose(slope, [0, 1, 0, 0])
 
 
-@pytest.mark.parametrize("door", ["to_scipy", "to_jaxlie"])
-def test_what_is_no_attitude_is_told_so(door, untyped):
+@pytest.mark.parametrize("function", ["to_scipy", "to_jaxlie"])
+def test_what_is_no_attitude_is_refused(function, untyped):
     with pytest.raises(
         ValueError, match=r"`attitude` must have shape \(4,\), but .* \(3,\)"
     ):
-        getattr(jr.io, door)(np.ones(3))
+        getattr(jr.io, function)(np.ones(3))
     with pytest.raises(
         ValueError, match=r"`position` must have shape \(3,\), but .* \(5, 3\)"
     ):
-        getattr(jr.io, door)(HALF, np.ones((5, 3)))
+        getattr(jr.io, function)(HALF, np.ones((5, 3)))
 
 
 def m2q(matrix):
@@ -268,11 +268,11 @@ def test_a_part_that_is_no_body_is_named_with_what_to_do(rng):
         jr.io.from_trimesh(lump(rng), -1.0)
     with pytest.raises(ValueError, match=r"`scale` must be positive, but it is -1.0"):
         jr.io.from_trimesh(lump(rng), scale=-1.0)
-    for door in (jr.io.from_trimesh, jr.io.mesh_arrays):
+    for function in (jr.io.from_trimesh, jr.io.mesh_arrays):
         with pytest.raises(
             ValueError, match=r"scene of trimesh, but it is a tuple.*`jrigid.from_m"
         ):
-            door((mesh.vertices, mesh.faces))
+            function((mesh.vertices, mesh.faces))
 
 
 @pytest.mark.parametrize(

@@ -421,7 +421,7 @@ def test_derivatives_of_a_singular_lane_are_zero_and_touch_no_other():
     lanes = np.stack([TOP_Q, UPRIGHT, TOP_Q])
     field = lagrangian.vector_field(symmetric_top)
     step = lambda q, mgl: field(0.0, (q, TOP_Q_DOT), (*TOP[:2], mgl))[1]  # noqa: E731
-    # a parameter that the lanes share is not spoilt by the singular one
+    # a parameter that the lanes share is not changed by the singular one
     sharing = np.stack([TOP_Q, UPRIGHT, TOP_Q * np.nan, TOP_Q * np.inf])
     shared = lambda mgl: jnp.nansum(jax.vmap(one_top, (0, None))(sharing, mgl))  # noqa: E731
 

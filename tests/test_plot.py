@@ -137,7 +137,7 @@ def test_bodies_of_revolution_and_spheres_have_polhodes(moments):
 @pytest.mark.parametrize(
     ("moments", "omega"),
     [
-        ((1.0, 2.0, 3.0), (0.0, 1.0, 0.0)),  # about the middle axis
+        ((1.0, 2.0, 3.0), (0.0, 1.0, 0.0)),  # about the intermediate axis
         ((1.0, 1.0, 2.0), (0.7, 0.2, 0.0)),  # across the axis of revolution
         ((1.0, 2.0, 2.0), (0.0, 0.7, 0.2)),
     ],

@@ -48,7 +48,7 @@ def _slow(*values):
     ],
 )
 def test_ten_thousand_turns_keep_the_promised_accuracy(ten_thousand_turns, rtol, unit):
-    """DESIGN.md's bars for integration; omega in other units of time behaves the same."""
+    """The promised accuracy; omega in other units of time behaves the same."""
     start, ts, attitudes, omegas = ten_thousand_turns
     body = jr.RigidBody(MOMENTS)
     state0 = jr.State(ATTITUDE, start * unit)
@@ -508,7 +508,7 @@ def test_invariants_of_a_vmapped_trajectory():
     assert many.energy.shape == (2, 3)
     assert many.angular_momentum.shape == (2, 3, 3)
     states = many.states
-    for k in range(3):  # of the other lane, as told by its states alone
+    for k in range(3):  # of the other lane, as its states show alone
         state = jr.State(
             states.attitude[1, k], states.omega[1, k], (states.internal[0][1, k],)
         )

@@ -204,9 +204,9 @@ def test_what_is_done_is_not_done_again_and_what_is_spoilt_is(tmp_path):
     names = sorted(x for x in before if "vector" in str(x) or "product" in str(x))
     short, flipped, lost = names[0], names[3], names[-1]
     short.write_bytes(short.read_bytes()[:-9])
-    spoilt = bytearray(flipped.read_bytes())
-    spoilt[5] ^= 1
-    flipped.write_bytes(spoilt)
+    damaged = bytearray(flipped.read_bytes())
+    damaged[5] ^= 1
+    flipped.write_bytes(damaged)
     lost.unlink()
     (lost.parent / "0.abc.partial").write_bytes(b"half")
     quiet(tree, AXES, store=store)
@@ -742,7 +742,7 @@ def test_a_store_whose_description_is_spoilt_loses_nothing(tmp_path):
     for file in (store / "sine" / "zarr.json", store / "valid" / "zarr.json"):
         kept = file.read_bytes()
         file.write_bytes(kept[:40])
-        with pytest.raises(OSError, match="is spoilt"):
+        with pytest.raises(OSError, match="is damaged"):
             quiet(function, axes, store=store)
         file.write_bytes(kept)
     assert chunks(store) == before

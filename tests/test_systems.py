@@ -573,15 +573,15 @@ def test_a_bad_inertia_is_found_whatever_the_torque(inertia):
 
 
 def test_a_bad_body_in_flight_is_found_by_its_mass_or_inertia():
-    spoilt = lambda leaf, value: eqx.tree_at(leaf, jr.FloatingBody(BODY), value)  # noqa: E731
+    changed = lambda leaf, value: eqx.tree_at(leaf, jr.FloatingBody(BODY), value)  # noqa: E731
     for system, code, message in (
         (
-            spoilt(lambda s: s.mass_properties.mass, jnp.array(-1.0)),
+            changed(lambda s: s.mass_properties.mass, jnp.array(-1.0)),
             jr.RESULTS.invalid_mass,
             r"`mass` must be positive and finite, but it is not: -1\.0",
         ),
         (
-            spoilt(lambda s: s.mass_properties.inertia, jnp.full((3, 3), jnp.nan)),
+            changed(lambda s: s.mass_properties.inertia, jnp.full((3, 3), jnp.nan)),
             jr.RESULTS.invalid_inertia,
             r"`inertia` must hold .*, but it is not: \[\[nan",
         ),

@@ -274,9 +274,9 @@ def test_gravity_gradient_of_the_earth_seen_in_float32():
 def test_gravity_gradient_at_the_bodys_own_position():
     position = np.asarray(orbit(0.7))
     flying = jr.FloatingState(position, OMEGA, ATTITUDE, OMEGA)
-    own, told = tq.GravityGradient(MU).of_body(TENSOR), POTENTIALS["gradient, tensor"]
-    np.testing.assert_array_equal(own(0.0, flying, None), told(0.7, STATE, None))
-    assert own.potential(0.0, flying, None) == told.potential(0.7, STATE, None)
+    own, given = tq.GravityGradient(MU).of_body(TENSOR), POTENTIALS["gradient, tensor"]
+    np.testing.assert_array_equal(own(0.0, flying, None), given(0.7, STATE, None))
+    assert own.potential(0.0, flying, None) == given.potential(0.7, STATE, None)
 
 
 def test_a_dipole_against_numpy_in_a_field_of_time_and_place():

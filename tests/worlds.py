@@ -512,10 +512,10 @@ def random_times(rng, count, mean_step, jitter=0.3, gaps=0.01):
 
 @dataclass(frozen=True)
 class Record:
-    """What a gyro told of one motion, and the truth.
+    """Readings of a gyro in one motion, and the truth.
 
     Attributes:
-        tensor: Inertia (3, 3), mean moment 1 unless told.
+        tensor: Inertia (3, 3), mean moment 1 unless given.
         ts: Times (samples,) [s].
         omega: True rates at the times (samples, 3) [rad/s].
         readings: Of the gyro (samples, 3) [rad/s].

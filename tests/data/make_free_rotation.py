@@ -207,7 +207,7 @@ def draw():
 
 
 def split(values):
-    """The nearest doubles and what is left."""
+    """The nearest doubles, and the rest."""
     high = [float(v) for v in values]
     with mp.workdps(60):
         return high, [float(v - h) for v, h in zip(values, high, strict=True)]

@@ -25,7 +25,7 @@ FOLLOWED = 0.3  # of the square of the record: a fit that leaves more does not f
 # Whitened square of a sample, above its degrees of freedom, that is no noise.
 _REJECTED = 16.0
 _ROUNDING = 100.0  # times the resolution of numbers
-_SPOILT = 0.25  # fraction of samples rejected that excludes a trial
+_MOST_REJECTED = 0.25  # fraction of samples rejected that excludes a trial
 _AT_BOUNDARY = 1e-3  # how wrong a fit counts that ended at a boundary
 _MAD = 1.4826  # standard deviations of a normal number in its median size
 
@@ -158,13 +158,13 @@ def without_outliers(
     width = np.sum(problem.samples.weight, axis=-1)
     square = np.sum(residual**2, axis=-1)
     good = square / of_samples(problem, scales**2) < width + _REJECTED
-    spoilt = np.zeros(kept.shape[0], bool)
+    excluded = np.zeros(kept.shape[0], bool)
     for part in problem.samples.parts:  # a trial that one record excludes is excluded
         bad = np.sum(np.where(good, 0.0, kept)[:, part], axis=1)
-        spoilt |= bad > _SPOILT * np.sum(kept[:, part], axis=1)
+        excluded |= bad > _MOST_REJECTED * np.sum(kept[:, part], axis=1)
     # A fit of nothing says nothing: if all trials are bad, each keeps what is good.
-    spoilt &= ~np.all(spoilt)
-    return np.where(good & ~spoilt[:, None], kept, 0.0)
+    excluded &= ~np.all(excluded)
+    return np.where(good & ~excluded[:, None], kept, 0.0)
 
 
 def weights_of(problem: Problem, kept: np.ndarray) -> np.ndarray:
@@ -217,7 +217,7 @@ def _square_of_rounding(fit: Fit) -> float:
 def is_exact(fit: Fit) -> bool:
     """Whether a fit leaves no more than rounding of a record without a stated noise.
 
-    What is left then has neither a size nor a colour that would say anything.
+    Its residuals then have neither a size nor a colour that would say anything.
     """
     # A stated noise says what is little. A plan, which leaves nothing, has one.
     if fit.problem.options.noise_known:

@@ -248,7 +248,7 @@ def _of_gyro_error(name: str, value: np.ndarray) -> str:
     if name == "delay":
         return (
             f"A delay of the gyro by some {numbers} s, after the other sensors, would "
-            "explain most of what is left: pass it (`Gyro(delay=...)`), or seek it "
+            "explain most of the residuals: pass it (`Gyro(delay=...)`), or seek it "
             "(`free`). A low-pass filter delays by its time constant."
         )
     if name == "gain":
@@ -377,7 +377,7 @@ def _of_noise(result: FitResult) -> str:
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
     if stands_out(band, sure):
         return (
-            f"What is left has {band:.2g} times its mean power in one band of "
+            f"The residuals have {band:.2g} times their mean power in one band of "
             "frequencies: something that changes slowly, or swings, is missing. See "
             "`unmodelled` and `free`."
         )

@@ -249,7 +249,7 @@ def read_alcdef(
 def _check_one_object(parser: _Parser) -> None:
     """Raise ValueError for sessions of several objects.
 
-    Objects without a number have 0, and are told by their designations. A numbered
+    Objects without a number have 0, and are identified by their designations. A numbered
     object may have several of these.
     """
     first: dict[str, str] = {}

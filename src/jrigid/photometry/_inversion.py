@@ -35,7 +35,7 @@ from jrigid.photometry._periodogram import cycles_within, points_of
 from jrigid.photometry._tumbler_search import APART, Found, index_of_mirror, search
 
 _INERTIA = ("homogeneous", "free")
-# Noise of the first search where none is given [mag]; what is left replaces it.
+# Noise of the first search where none is given [mag]; the rms residual replaces it.
 _FIRST_NOISE = 0.02
 _HOUR = 3600.0
 # Of the ratio of two axes: the light of such a body hardly changes as it rotates.
@@ -186,7 +186,7 @@ def find_tumblers(
     Returns:
         The aliases. The shape is an ellipsoid by Lommel-Seeliger's law, of which the
         longest semi-axis is 1. Ellipsoids look alike after half turns about their axes,
-        so orientations that differ by these are given once.
+        so attitudes that differ by these are given once.
 
     Raises:
         ValueError: Curves or options from which nothing follows.
@@ -370,7 +370,7 @@ def _verdict(inversion: Inversion) -> str:
     if not inversion.follows:
         return (
             "No tumbler was found that follows the light curves to their noise: "
-            f"{value}, and what is left at neighbouring points correlates by "
+            f"{value}, and residuals at neighbouring points correlate by "
             f"{inversion.correlation:.2f}. A stated noise is too small, the body is no "
             "ellipsoid, or its periods were not among the `pairs`."
         )

@@ -167,12 +167,12 @@ def _report(plan: NightPlan) -> str:
     for index, (start, end), pairs in zip(
         plan.chosen, plan.dates, plan.decided, strict=True
     ):
-        told = ", ".join(
+        pairs_told_apart = ", ".join(
             f"{i} from {j} ({plan.growth[i - 1, j - 1]:.0f})" for i, j in pairs
         )
         lines.append(
             f"curve {index}, JD {start:.2f} to {end:.2f}: "
-            + (f"tells {told} apart" if told else "helps")
+            + (f"tells {pairs_told_apart} apart" if pairs_told_apart else "helps")
         )
     count = len(plan.growth)
     missed = [

@@ -29,7 +29,7 @@ ANGLES = 8
 _LANES = 4  # motions at once: each has all directions as lanes of its own
 
 
-def orientations() -> Float[np.ndarray, "many 3 3"]:
+def attitudes_tried() -> Float[np.ndarray, "many 3 3"]:
     """Axes with z along the momentum, rows in space: even poles, and turns about them.
 
     Those of one pole follow each other.
@@ -77,7 +77,7 @@ def scanned(
     turned: Float[Array, "many 3 3"],
     readings: Readings,
 ) -> Float[Array, "lanes many"]:
-    """Chi-square of each lane in all orientations, in single precision.
+    """Chi-square of each lane in all attitudes, in single precision.
 
     Args:
         numbers: Their poles and angles of precession are not used.

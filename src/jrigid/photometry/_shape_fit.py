@@ -462,8 +462,8 @@ def _report(fit: ShapeFit) -> str:
     warnings = []
     if not fit.follows:
         warnings.append(
-            "The fit does not follow the light curves to their noise, and what is left "
-            f"at neighbouring points correlates by {fit.correlation:.2f}: its periods, "
+            "The fit does not follow the light curves to their noise, and residuals "
+            f"at neighbouring points correlate by {fit.correlation:.2f}: its periods, "
             "the epoch or the moments of the start are wrong, a stated noise is too "
             "small, or the body is far from convex. The errors mean nothing."
         )

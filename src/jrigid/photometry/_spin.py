@@ -555,7 +555,7 @@ def _verdict(found: SpinInversion) -> str:
     if not found.follows:
         return (
             "No steady rotation was found that follows the light curves to their noise: "
-            f"{value}, and what is left at neighbouring points correlates by "
+            f"{value}, and residuals at neighbouring points correlate by "
             f"{found.correlation:.2f}. The body tumbles or is far from convex, its "
             "period is out of the range, `scattering` is another law, `degree` or "
             "`facets` are too few, or a stated noise is too small."

@@ -27,9 +27,9 @@ from jrigid.photometry._periodogram import frequency_pairs, strongest_lines, unl
 from jrigid.photometry._pole import direction_of_pole
 from jrigid.photometry._scan import (
     ANGLES,
+    attitudes_tried,
     fewer_epochs,
     frame_of,
-    orientations,
     scanned,
 )
 
@@ -230,8 +230,8 @@ def _starts(
     mode: Mode,
     choose: Choice,
 ) -> Found:
-    """Chosen orientations of the motions of each candidate."""
-    turned = orientations()
+    """Chosen attitudes of the motions of each candidate."""
+    turned = attitudes_tried()
     few = fewer_epochs(readings)
     tasks = _tasks(len(numbers), mode, _LOOSE)
     values = in_batches(

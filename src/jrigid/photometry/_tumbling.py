@@ -130,7 +130,7 @@ def _tilts_and_energy(
         ]
     )
     # The motion is about the smallest moment's axis where its energy is above that of
-    # rotation about the middle axis. The quotients do not show this if two moments are
+    # rotation about the intermediate axis. The quotients do not show this if two moments are
     # equal.
     long_axis = above > largest / middle - 1
     sines = jnp.clip(jnp.where(long_axis, about_smallest, about_largest), 0.0, 1.0)
@@ -275,7 +275,7 @@ def _of_energy(
     """The angular velocity of `omega_from_energy`; NaN where there is none."""
     principal = principal_axes(inertia)
     smallest, middle, largest = principal.moments
-    # E/E0 of a rotation about the middle axis, and about the one that is circled.
+    # E/E0 of a rotation about the intermediate axis, and about the one that is circled.
     highest = largest / middle
     circled = largest / smallest if long_axis else jnp.ones_like(largest)
     # How far the energy is from that about the circled axis to that about the middle

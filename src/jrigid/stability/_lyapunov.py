@@ -208,7 +208,7 @@ def _follow(
         y, local = path.follow(index * schedule.steps, schedule.steps, y)
         # Otherwise all tangents would turn into the direction of fastest growth.
         rows, lengths = orthonormal(path.tangents(y))
-        # Of nearly parallel tangents rounding is what is left.
+        # Nearly parallel tangents differ by rounding alone.
         apart = _are_independent(path.tangents(y), lengths)
         local = jnp.where(apart, local, jnp.inf)
         # The rows had length 1 at the start of the interval.

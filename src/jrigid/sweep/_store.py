@@ -233,7 +233,7 @@ class Store:
                 self._axes = {name: group[name] for name in self.grid.axes}
             except (KeyError, ValueError) as error:
                 text = (
-                    f"The store {self.path} is spoilt: its description is not whole "
+                    f"The store {self.path} is damaged: its description is not whole "
                     f"({error!r})."
                 )
                 raise OSError(text) from error
