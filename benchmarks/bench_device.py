@@ -106,7 +106,7 @@ def scan(motions):
     """Chi-square of many starting points: motions times attitudes."""
     numbers, tasks = starting_points(motions)
     few = _scan.fewer_epochs(readings())
-    turned = _scan.attitudes()
+    turned = _scan.attitudes_tried()
     first, least, _ = bench_lanes.seconds(_scan.scanned, numbers, tasks, turned, few)
     many = motions * len(turned)
     name = f"scan of starting points, {_curve_readings.EPOCHS} epochs: {many:,}"

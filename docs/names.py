@@ -38,7 +38,8 @@ def written() -> str:
         for name, module in inspect.getmembers(jrigid)
         if inspect.ismodule(module) and hasattr(module, "__all__")
     }
-    own = [x for x in dir(jrigid) if x[0] != "_" and x not in modules]
+    members = dict(inspect.getmembers(jrigid))
+    own = [k for k, x in members.items() if k[0] != "_" and not inspect.ismodule(x)]
     parts = [f"### jrigid\n\n{table(jrigid, own)}\n"]
     for name, module in modules.items():
         parts.append(f"### jrigid.{name}\n\n{table(module, module.__all__)}\n")

@@ -1,6 +1,7 @@
 """Code in README and docs/ runs: the blocks of a page, after the usual imports."""
 
 import functools
+import importlib.util
 import json
 import re
 import sys
@@ -24,7 +25,10 @@ PAGES = [
 
 
 # What takes long in CI; recipes are all run.
-LONG = re.compile(r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate", re.DOTALL)
+LONG = re.compile(
+    r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate|photometry\.fit_shape\(",
+    re.DOTALL,
+)
 # What takes minutes to compile, in recipes too.
 SLOW = re.compile(r"jr\.photometry\.find_tumblers\(")
 LONG_PAGES = [
@@ -120,3 +124,12 @@ def test_notebooks_draw_in_ten_lines(path):
         drawing = [i for i, line in enumerate(code) if DRAWS.search(line)]
         if cell["cell_type"] == "code" and drawing:
             assert len(code) - drawing[0] <= 10, (cell["id"], code[drawing[0]])
+
+
+def test_the_table_of_all_names_is_current():
+    path = ROOT / "docs" / "names.py"
+    spec = importlib.util.spec_from_file_location("names", path)
+    names = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(names)
+    message = "run `python docs/names.py`"
+    assert names.PAGE.read_text() == names.written(), message

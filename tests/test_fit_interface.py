@@ -580,6 +580,11 @@ def test_the_version_is_that_of_the_package(capsys):
             "seek it (`free`), by `free=lambda body, gyro: gyro.bias`.",
             "seek it by `--bias`.",
         ),
+        (
+            "pass it (`Gyro(delay=...)`), or seek it (`free`).",
+            "pass it in Python (`Gyro(delay=...)`).",
+        ),
+        ('`loss="robust"` leaves such trials out', "`--robust` leaves such trials out"),
         ("See `unmodelled` and `free`.", "See `--unmodelled` and `--bias`."),
         ("Pass `sigma`, or the torque", "Pass `--sigma`, or the torque"),
         ("or `absolute_sigma=False`.", "or no `--sigma`."),

@@ -1229,6 +1229,7 @@ def test_progress_is_shown_on_a_terminal_by_default(
         identify.Rates(SHORT, omegas + 1e-4 * rng.normal(size=omegas.shape), 1e-4),
     )
     shown = capsys.readouterr()
+    assert "compiles the first stage" in shown.err
     assert "chi-square" in shown.err
     assert ("stages" in shown.err) is with_tqdm
     assert "chi-square" not in shown.out

@@ -111,6 +111,78 @@ def test_a_sigma_of_another_size_is_named(readings, factor, text):
     assert f"`sigma` is {text}" in line
 
 
+def short_record(rng, count=30, turned=1.5):
+    """Readings while a body turns by so many radians."""
+    ts = np.linspace(0, turned / np.linalg.norm([6.0, 5.0, -6.0]), count)
+    return ts, motion(ts) + NOISE * rng.normal(size=(count, 3))
+
+
+def test_a_short_record_shows_no_swing(rng):
+    """Its trend looks like a period as long as the record."""
+    ts, values = short_record(rng)
+    for sigma in (NOISE, None):
+        found = identify.fit(BLIND, identify.Rates(ts, values, sigma), throw=False)
+        assert "swing" not in str(found), found
+
+
+def test_a_sigma_that_is_too_small_is_named_in_a_short_record(rng):
+    ts, values = short_record(rng)
+    found = identify.fit(BLIND, identify.Rates(ts, values, NOISE / 50), throw=False)
+    assert found.status != Status.OK
+    assert "`sigma` is too small" in str(found).splitlines()[0]
+
+
+@pytest.mark.parametrize("count", [30, 200])
+def test_a_sigma_that_hides_the_inertia_is_named(rng, count):
+    """A slow body: the noise as it is stated is larger than all rates but one."""
+    ts = np.arange(count) * 0.1
+    values = solved(ts, [2.0, 0.7, 1.5])(ts).T + 0.01 * rng.normal(size=(count, 3))
+    found = identify.fit(BLIND, identify.Rates(ts, values, 0.01), throw=False)
+    assert found.status == Status.OK
+    found = identify.fit(BLIND, identify.Rates(ts, values, 1.0), throw=False)
+    assert found.status != Status.OK
+    assert "`sigma` is too large" in str(found).splitlines()[0]
+
+
+def test_a_sigma_that_an_estimated_torque_hides_is_named(readings):
+    found, line = first_line(readings, NOISE / 50, unmodelled="estimate")
+    assert found.reduced_chi_square < 1.3
+    assert "`sigma` is too small" in line
+    found, line = first_line(readings, NOISE, unmodelled="estimate")
+    assert line == f"OK: {Status[found.status]}"
+
+
+def test_a_trial_of_another_body_is_named_by_a_plain_fit(rng):
+    ts = TS[::2]
+    trials = []
+    for index in range(6):
+        spin = 8 * worlds.random_axes(rng)[0]
+        tensor = np.diag(MOMENTS * ([1.1, 1, 1] if index == 3 else 1.0))
+        omega = worlds.tumble(tensor, spin, ts).omega
+        noise = NOISE * rng.normal(size=omega.shape)
+        trials.append(identify.Rates(ts, omega + noise, NOISE))
+    found = identify.fit(BLIND, trials, throw=False)
+    assert found.status == Status.MISFIT
+    line = str(found).splitlines()[0]
+    assert "Chi-square of trial 3 (from 0)" in line
+    assert 'loss="robust"' in line
+    found = identify.fit(BLIND, trials, loss="robust", throw=False)
+    np.testing.assert_array_equal(np.flatnonzero(found.rejected_trials), [3])
+
+
+def test_a_scale_that_a_known_drag_needs_is_named(rng):
+    drag = 0.3
+    body = jr.RigidBody(3 * MOMENTS, jr.torques.LinearDrag(jnp.full(3, drag)))
+    omega = solved(TS, [6.0, 5.0, -6.0], drag)(TS).T
+    record = identify.Rates(TS, omega + NOISE * rng.normal(size=omega.shape), NOISE)
+    found = identify.fit(body, record, throw=False)
+    assert found.status == Status.MISFIT
+    assert 'scale="known"' in str(found).splitlines()[0]
+    found = identify.fit(body, record, scale="known", throw=False)
+    assert found.status == Status.OK
+    assert "scale=" not in str(found).splitlines()[0]
+
+
 @pytest.mark.parametrize("size", [0.05, 0.3, 2.0])
 def test_a_bias_that_is_not_sought_is_named(readings, size):
     bias = size * np.array([1.0, -0.7, 0.4])

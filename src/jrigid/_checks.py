@@ -68,6 +68,7 @@ class Enumeration(eqx.Enumeration, metaclass=_Listed):
 
 
 class RESULTS(
+    # pyright takes it for an enum, which has no subclasses.
     diffrax.RESULTS,  # pyright: ignore[reportGeneralTypeIssues]
     metaclass=_Listed,
 ):
@@ -558,7 +559,7 @@ class Findings:
         return _Diagnosis(first, tuple(self._messages), tuple(self._values))
 
     def diagnosis_of(self, result: RESULTS) -> _Diagnosis:
-        """As `diagnosis`, with the message of the result code if no condition fails."""
+        """Find the first that fails, or the text of the result code if none fails."""
         code = code_of(result)
         first = jnp.where(
             self.ok, len(self._failed) + code, _first_failed(self._failed)

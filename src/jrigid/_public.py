@@ -1,4 +1,4 @@
-"""What `dir`, `help` and star imports of a module show."""
+"""Names that `dir`, `help` and star imports of a module show."""
 
 import inspect
 import sys

@@ -199,7 +199,7 @@ def vector_field(
 
     # diffrax passes `args` on as they are: None, or what the caller made of them.
     def field(
-        t: TimeLike,  # noqa: ARG001
+        t: TimeLike,  # noqa: ARG001 (diffrax passes it)
         y: tuple[CoordinatesLike, CoordinatesLike],
         args: Any,
     ) -> tuple[Coordinates, Coordinates]:
@@ -286,7 +286,7 @@ def cyclic_coordinates(
     *params: Any,
     reach: Real[ArrayLike, ""] | CoordinatesLike | None = None,
 ) -> Bool[Array, " n"]:
-    """Which coordinates the Lagrangian does not depend on: their momenta are conserved.
+    """Find the coordinates that L does not depend on, whose momenta are conserved.
 
     This is a numerical verdict. dL/dq_i must vanish at four fixed generic points about
     `q`, each at rest and in motion: to 64 rounding errors of the largest of the terms

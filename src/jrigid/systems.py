@@ -365,9 +365,7 @@ class FloatingBody(AbstractSystem):
         self.torque = as_torque(torque)
 
     @property
-    def inertia(  # pyright: ignore[reportIncompatibleVariableOverride]
-        self,
-    ) -> Float[Array, "..."]:
+    def inertia(self) -> Float[Array, "..."]:
         """Inertia tensor about the centre of mass [kg m^2]."""
         return self.mass_properties.inertia
 

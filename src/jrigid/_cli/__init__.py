@@ -41,12 +41,15 @@ _INERTIA_MODELS = ("tensor", "moments", "symmetric", "top", "flat")
 # later one precedes it.
 _OPTIONS = (
     (r"\(`free`\), by `free=[^`]*bias`", "by `--bias`"),
+    # The command line seeks nothing else of a gyro.
+    (r", or seek it \(`free`\)", ""),
+    (r"([Pp]ass it) \(`Gyro\(", r"\1 in Python (`Gyro("),
     (r"`free(=[^`]*bias)?`", "`--bias`"),
     (r"`unmodelled`", "`--unmodelled`"),
     (r"Arguments `sigma` and `covariance` of `Gyro`", "Argument `--sigma`"),
     (r"`sigma`", "`--sigma`"),
     (r"`absolute_sigma=False`", "no `--sigma`"),
-    (r"`loss`", "`--robust`"),
+    (r"`loss(=\"robust\")?`", "`--robust`"),
     (r"`inertia_model`", "`--inertia-model`"),
     (r"(?<=\. )[^.]*`throw=False`[^.]*", "`--plot` and `--save` show it"),
     (r"see `null_directions`", "see below what is not determined"),
@@ -165,7 +168,7 @@ def _with_options(text: str) -> str:
 
 
 def _trials(reading: records.Reading, by_flights: bool) -> list[records.Reading]:
-    """What is fitted: flights, or the stretches without a break."""
+    """The readings to fit: flights, or the stretches without a break."""
     message = "Argument `path` must hold rates of a gyro, but it has none."
     demand(reading.rates is not None, message)
     if by_flights:
@@ -197,7 +200,7 @@ def _at_rest(reading: records.Reading) -> tuple[np.ndarray | None, np.ndarray]:
 
 
 def _unit(text: str) -> tuple[str, str | float]:
-    """What a unit is of, and its name or the factor that it stands for."""
+    """The quantity of a unit, and the name of the unit or its factor."""
     kind, _, unit = text.rpartition("=")
     try:
         # Without `=` all of the text is the unit, and it is that of the rates.
@@ -248,7 +251,7 @@ def _fit(options: argparse.Namespace) -> int:
         # The noise was measured where the body rests.
         report = report.replace(
             "`sigma` is too", "the noise at rest, for `sigma`, is too"
-        )
+        ).replace(", or `absolute_sigma=False`", "")
     print(_with_options(report))
     if options.save:
         identify.save(options.save, result)

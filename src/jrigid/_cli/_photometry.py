@@ -177,7 +177,7 @@ def _span(curves: list[photometry.LightCurve]) -> float:
 
 
 def _summary(curves: list[photometry.LightCurve]) -> str:
-    """What was read, in a sentence."""
+    """A sentence that sums up the light curves that were read."""
     ts = np.concatenate([x.ts for x in curves])
     relative = sum(x.is_relative for x in curves)
     # All curves of a file have the same epoch.

@@ -1,1 +1,1 @@
-"""What every other package of jrigid builds on."""
+"""Parts on which every other package of jrigid builds."""

@@ -71,7 +71,7 @@ def _in_lanes(x: PyTree, has_lanes: bool, lanes: int) -> Array:
 
 
 def _results_vary(jaxpr: third_party.Jaxpr, batched: Sequence[bool]) -> list[bool]:
-    """Which results of a program have lanes if these of its arguments have."""
+    """Whether each result of a program has lanes if these of its arguments have."""
     known = dict(zip(jaxpr.invars, batched, strict=True))
 
     def has_lanes(x: Any) -> bool:
@@ -95,7 +95,7 @@ def _results_vary(jaxpr: third_party.Jaxpr, batched: Sequence[bool]) -> list[boo
 
 
 def _vary(scan: third_party.Scan, batched: Sequence[bool]) -> list[bool]:
-    """Which results of a scan have lanes.
+    """Whether each result of a scan has lanes.
 
     A part of the carry has lanes if an iteration gives it lanes.
     """

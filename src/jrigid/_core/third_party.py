@@ -46,6 +46,7 @@ def code_of(item: PyTree) -> Any:
     return item._value
 
 
+# pyright takes equinox's enumerations and their items for those of `enum`.
 class _Code(EnumerationItem):  # pyright: ignore[reportGeneralTypeIssues]
     """An item that `int` and numpy convert to its code."""
 
@@ -125,7 +126,7 @@ def shape_of(variable: Any) -> tuple[int, ...]:
 
 
 def used_inputs(program: core.ClosedJaxpr) -> list[bool]:
-    """For each input of a program, whether an output depends on it."""
+    """Whether an output of a program depends on each of its inputs."""
     jaxpr = program.jaxpr
     _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     return used

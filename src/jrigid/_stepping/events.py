@@ -29,7 +29,7 @@ class Conditions(NamedTuple):
     direction: tuple[bool | None, ...]
 
     def happened(self, before: Array, after: Array) -> Bool[Array, " conditions"]:
-        """Which conditions end the motion, by their values before and after a step."""
+        """Whether each condition ends the motion, by values before and after a step."""
         old = jnp.sign(before)
         new = jnp.sign(after)
         each = []
@@ -94,7 +94,7 @@ class Conditions(NamedTuple):
 
 
 def halvings(dtype: Any) -> int:
-    """How often a step is halved until rounding alone limits a time in it."""
+    """Number of halvings of a step after which only rounding limits a time in it."""
     return _BISECTIONS[jnp.dtype(dtype).itemsize]
 
 

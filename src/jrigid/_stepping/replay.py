@@ -40,7 +40,7 @@ class Cotangents(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What the reverse of an attempt needs.
+    """Data that the reverse of an attempt needs.
 
     Attributes:
         place: Time and length of the step, then the state at its start, as one array.

@@ -98,7 +98,7 @@ class _Sums(NamedTuple):
     def _weights_and_terms(
         self, iteration: Array, terms: tuple[Array, ...]
     ) -> list[tuple[Array, Array]]:
-        """For each table, the coefficients of a row and the terms that they weight."""
+        """Coefficients of a row and the terms that they weight, for each table."""
         row = self.row(iteration)
         return [
             # `equal_steps` evaluates one stage less than a table has columns.

@@ -62,7 +62,7 @@ class Stepper(Protocol):
         ...
 
     def end(self, t: Array, step: Array, goal: Array) -> Float[Array, ""]:
-        """Where a step of about this length ends, on the way to a time."""
+        """Time at which a step of about this length ends, on the way to a goal."""
         ...
 
     def attempt(

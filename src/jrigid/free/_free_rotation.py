@@ -324,7 +324,7 @@ def _steepest(slopes: Array) -> Array:
 
 
 def _close_pairs(widening: Array) -> Array:
-    """Which pairs of moments, 23, 31 and 12, have a close gap."""
+    """Whether each pair of moments, 23, 31 and 12, has a close gap."""
     # The gap between I1 and I3 is close only where both others are.
     low, _, high = widening != 0
     return jnp.stack([high, low & high, low])[:, None]

@@ -1,4 +1,4 @@
-"""Inertia from what was observed: the fit, what it can tell, its numbers and its linear starts."""
+"""Inertia from observations: the fit, plans, unknown numbers and linear estimates."""
 
 from jrigid._public import list_public_names as _list_public_names
 from jrigid.identify._compare import Comparison as Comparison

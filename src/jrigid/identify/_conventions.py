@@ -26,7 +26,7 @@ from jrigid.torques import Rotor
 
 # Chi-square for each degree of freedom beyond which another reading is worth a try, and
 # the part of it that is left if that reading is right.
-_FAR = 10.0
+_LARGE_MISFIT = 10.0
 _LEFT = 0.25
 # Turns of attitudes and of rates are compared over a radian. They agree to this, in
 # which there is room for noise, for errors of a gyro and for other times of samples.
@@ -137,7 +137,7 @@ def readings(records: Records) -> Iterator[tuple[int, Records]]:
 
 def is_far(fit: Fit) -> bool:
     """Whether a fit is so wrong that another convention is worth a try."""
-    return misfit(fit) > _FAR or unexplained(fit) > FOLLOWED
+    return misfit(fit) > _LARGE_MISFIT or unexplained(fit) > FOLLOWED
 
 
 def explains(other: Fit, fit: Fit) -> bool:
@@ -259,7 +259,7 @@ def _seen(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def in_words(conventions: np.ndarray) -> str:
-    """Which conventions the record seems to have, or an empty text without any."""
+    """Name the conventions that the record seems to have; empty without any."""
     is_scalar_last, is_space_to_body, is_in_degrees, is_along_space, reverse = (
         conventions
     )

@@ -1,4 +1,4 @@
-"""How often a body turned in the long gaps of a record.
+"""Minima that differ in how often a body turned in the long gaps of a record.
 
 A part of a record tells the rate at which the body turns with an error. Over a gap this
 error grows, and where it reaches half a turn the number of turns in the gap is a guess:
@@ -19,8 +19,8 @@ from jrigid.identify._smoother import Move, Point
 _GAP = 3.5  # radians that a body turns in a gap
 _LONG = 10.0  # times the median interval of its trial that a gap lasts
 _GAPS = 4  # of a trial, the longest, that are looked at
-_SURE = 0.2  # radians: an error that leaves no doubt of the number of turns
-_FAR = 5.0  # standard errors to which other numbers of turns are looked for
+_UNDOUBTED_ANGLE = 0.2  # radians: an error that leaves no doubt of the number of turns
+_ERRORS_SEARCHED = 5.0  # standard errors to which other numbers of turns are looked for
 _STEP = 0.5  # radians between places to look at; minima are some six radians apart
 _MOST = 400  # places to look at beside one gap
 _SHOWN = 1e-7  # of the largest singular value: a direction that the record shows
@@ -86,7 +86,7 @@ def gaps_of(fit: Fit) -> list[Gap]:
 def places_beside(
     side: Fit, whole: Fit, trial: int, predicted: np.ndarray, noise: float
 ) -> Places:
-    """Where to look for minima that differ in the number of turns in a gap.
+    """Find places of minima that differ in the number of turns in a gap.
 
     Args:
         side: A fit of the record without the samples on one side of the gap.
@@ -107,7 +107,7 @@ def places_beside(
     _, sizes, vt = np.linalg.svd(effect, full_matrices=False)
     angles = np.sqrt(noise) * sizes / size
     # Two counts may be open, that of turns and that of wobbles.
-    large = angles[angles > _SURE][:2]
+    large = angles[angles > _UNDOUBTED_ANGLE][:2]
     offsets, complete = _offsets(large)
     changes = (offsets * _STEP * size / sizes[: large.size]) @ vt[: large.size]
     points = [
@@ -141,7 +141,7 @@ def _errors(fit: Fit, trial: int) -> tuple[np.ndarray, np.ndarray]:
 def _effect(
     fit: Fit, trial: int, of_numbers: np.ndarray, of_local: np.ndarray
 ) -> np.ndarray:
-    """What changes do to the whitened samples of a trial (samples, degrees, columns)."""
+    """Effect of changes on whitened samples of a trial (samples, degrees, columns)."""
     rows = condensed_rows(fit)
     count = fit.kept.shape[1]
     own = fit.minimum.point.own.shape[-1]
@@ -151,7 +151,7 @@ def _effect(
 
 
 def _offsets(angles: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Where to look, in steps along directions with these standard errors [rad].
+    """Offsets to try, in steps along directions with these standard errors [rad].
 
     Returns:
         Offsets (places, directions), and whether they reach as far as they should.
@@ -159,7 +159,7 @@ def _offsets(angles: np.ndarray) -> tuple[np.ndarray, bool]:
     grid = np.zeros((1, 0))
     complete = True
     for angle in angles:
-        steps = int(np.ceil(_FAR * angle / _STEP))
+        steps = int(np.ceil(_ERRORS_SEARCHED * angle / _STEP))
         most = (_MOST // len(grid) - 1) // 2
         complete = complete and steps <= most
         along = np.arange(-min(steps, most), min(steps, most) + 1.0)
@@ -167,7 +167,7 @@ def _offsets(angles: np.ndarray) -> tuple[np.ndarray, bool]:
             [np.column_stack([grid, np.full(len(grid), x)]) for x in along]
         )
     # Within an ellipse of so many standard errors, and one step beyond it.
-    beyond = _FAR + _STEP / np.min(angles, initial=np.inf)
+    beyond = _ERRORS_SEARCHED + _STEP / np.min(angles, initial=np.inf)
     is_inside = np.linalg.norm(grid * _STEP / angles, axis=1) <= beyond
     return grid[is_inside], complete
 

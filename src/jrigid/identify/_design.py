@@ -1,4 +1,4 @@
-"""What a planned record would determine, profile likelihoods and residuals."""
+"""Plans of records and their expected precision, profile likelihoods and residuals."""
 
 import dataclasses
 from collections.abc import Callable
@@ -215,7 +215,7 @@ class _Planned(NamedTuple):
 def _unknowns(
     plan: Plan, records: tuple[Record, ...], samples: Samples
 ) -> tuple[Unknowns, AnyArray]:
-    """What a plan seeks, and its numbers for the assumed tensor."""
+    """Unknowns that a plan seeks, and their numbers for the assumed tensor."""
     trials, _ = samples.ts.shape
     dtype = samples.ts.dtype
     model = plan.inertia_model

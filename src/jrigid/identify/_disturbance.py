@@ -79,7 +79,7 @@ class Disturbance(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What the torque adds to the state over each link.
+    """Change of the state over each link that is due to the torque.
 
     The state has rates, turns if it has an attitude, and the torque.
 

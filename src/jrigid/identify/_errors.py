@@ -1,11 +1,11 @@
-"""What a fit determines: errors, what the record leaves open, and how the fit ended.
+"""Errors of a fit, directions that the record leaves open, and status of the fit.
 
 Plain numpy, on the host: small matrices, once for each fit.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
@@ -402,7 +402,7 @@ def _resized(
     x: np.ndarray,
     parts: Sequence[slice],
     lengths: Sequence[int],
-    mode: str = "constant",
+    mode: Literal["constant", "edge"] = "constant",
 ) -> np.ndarray:
     """Samples of each record, cut to these lengths, or filled with zeros.
 
@@ -419,13 +419,13 @@ def _resized(
         own = x[:, part][:, :n]
         if own.shape[1] < n:
             missing = [(0, 0), (0, n - own.shape[1])] + [(0, 0)] * (x.ndim - 2)
-            own = np.pad(own, missing, mode)  # type: ignore[call-overload]
+            own = np.pad(own, missing, mode)
         resized.append(own)
     return np.concatenate(resized, axis=1)
 
 
 def _of_lengths(samples: Samples, lengths: Sequence[int]) -> Samples:
-    """Without the samples that fill a record up to a rounded number."""
+    """The samples without those that fill a record up to a rounded number."""
     parts = samples.parts
     values = [
         _resized(x, [slice(None)], [n], "edge")
@@ -498,7 +498,7 @@ def _kicks(fit: Fit) -> float:
 
 
 class _Remainder(NamedTuple):
-    """What a fit does not explain of its record.
+    """Part of a record that its fit does not explain.
 
     Attributes:
         chi_square: Sum of squares, of what is known beforehand and of an unmodelled
@@ -577,7 +577,7 @@ def _band(fit: Fit, white: np.ndarray) -> tuple[float, float]:
 
 
 class _Judgement(NamedTuple):
-    """How well a fit describes its record.
+    """Judgement of how well a fit describes its record.
 
     Attributes:
         status: Name of the status, as far as it does not depend on the ratios.

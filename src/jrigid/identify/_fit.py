@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cached_property
@@ -300,35 +301,60 @@ def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
     if progress is not None or not sys.stderr.isatty():
         yield print if progress else None
         return
-    try:
-        from tqdm import tqdm
-    except ModuleNotFoundError:
-        yield _late_lines()
-        return
-    # The number of stages is not known beforehand, so that the bar has no end.
-    bar = tqdm(unit=" stages", delay=_PATIENCE, leave=False, mininterval=0, miniters=1)
-    with bar:
+    with contextlib.ExitStack() as stack:
+        try:
+            from tqdm import tqdm
+        except ModuleNotFoundError:
+            show, wait = _late_lines()
+        else:
+            # The number of stages is not known beforehand: the bar has no end.
+            bar = tqdm(
+                unit=" stages", delay=_PATIENCE, leave=False, mininterval=0, miniters=1
+            )
+            stack.enter_context(bar)
+            show, wait = _on_bar(bar)
+        # The first stage ends seconds after it began where its program is compiled.
+        timer = threading.Timer(_PATIENCE, wait, ["fit: compiles the first stage"])
+        timer.daemon = True
+        timer.start()
+        stack.callback(timer.cancel)
 
-        def show(line: str) -> None:
-            bar.set_postfix_str(line, refresh=False)
-            bar.update()
+        def show_stage(line: str) -> None:
+            timer.cancel()
+            show(line)
 
-        yield show
+        yield show_stage
 
 
-def _late_lines() -> Callable[[str], None]:
-    """Return a function that prints a line once some seconds have passed."""
+_Show = Callable[[str], None]
+
+
+def _on_bar(bar: Any) -> tuple[_Show, _Show]:
+    """Return functions that show a stage, and a text before the first one."""
+
+    def show(line: str) -> None:
+        bar.set_postfix_str(line, refresh=False)
+        bar.update()
+
+    return show, bar.set_postfix_str
+
+
+def _late_lines() -> tuple[_Show, _Show]:
+    """Return functions that print a stage after some seconds, and a text at once."""
     start = time.perf_counter()
+
+    def wait(line: str) -> None:
+        print(line, file=sys.stderr)
 
     def show(line: str) -> None:
         if time.perf_counter() - start > _PATIENCE:
-            print(line, file=sys.stderr)
+            wait(line)
 
-    return show
+    return show, wait
 
 
 class _Question(NamedTuple):
-    """What is asked of every record: the keyword arguments of `fit`."""
+    """Keyword arguments of `fit`, which apply to every record."""
 
     free: Callable[..., Any] | None
     scale: str
@@ -463,7 +489,7 @@ def _task(question: _Question, bodies: _Bodies, observations: Any, start: Any) -
 
 
 def _torque(unmodelled: Any, noise_known: bool) -> tuple[str, GaussMarkov]:
-    """What is to be done about the unmodelled torque, and the torque if it is known."""
+    """Treatment of the unmodelled torque, and the torque if it is known."""
     if isinstance(unmodelled, str):
         check_option("unmodelled", unmodelled, ("estimate",))
         return "estimate", GaussMarkov(0.0)
@@ -542,7 +568,7 @@ def _shows_attitude(sensor: AbstractSensor) -> bool:
 
 
 class _Observed(NamedTuple):
-    """What the records tell of the motion, and of the sizes of rates and values.
+    """Estimates from the records: the motion, and the sizes of rates and values.
 
     Attributes:
         samples: Of all records.
@@ -608,7 +634,7 @@ def _observed(
 def _first_attitude(
     records: tuple[Record, ...], state: State | None, options: Options
 ) -> np.ndarray | None:
-    """Attitude of each trial from which rates are integrated, if anything depends on it."""
+    """Attitude of each trial at which integration of rates begins; None if unused."""
     if not options.depends_on_attitude:
         return None
     dtype = records[0].values.dtype
@@ -620,7 +646,7 @@ def _first_attitude(
 
 
 class _Opening(NamedTuple):
-    """Where the search begins.
+    """Unknowns, layouts and initial values with which a search begins.
 
     Attributes:
         unknowns: What is sought, with the frame of the inertia model chosen.
@@ -680,7 +706,7 @@ def _opening(
 
 @np.errstate(all="ignore")  # values that are bad or out of range
 def _case(task: _Task, effort: Effort, throw: bool) -> tuple[Case, Any]:
-    """Where the search of a record begins, and the result code of the input."""
+    """The case to search, with its initial values, and the result code of the input."""
     options = task.options
     records, state, tensor = on_host((task.records, task.state, task.tensor))
     if options.motion is None:  # which may ask for times that increase
@@ -773,7 +799,7 @@ def _read_anew(case: Case, problem: Problem, opening: _Opening) -> Case:
 
 
 def _along_the_torque(problem: Problem, opening: _Opening) -> tuple[Problem, bool]:
-    """The problem, with steps that end at jumps if need be; do they follow the torque?"""
+    """The problem, with steps that end at jumps if needed, and whether they suffice."""
     if is_resolved(problem, opening.cut, opening.point):
         return problem, True
     jumps = jumps_in_a_segment(problem, opening.cut, opening.point)
@@ -829,7 +855,7 @@ def _judged(
 def _unknowns(
     task: _Task, records: tuple[Record, ...], observed: _Observed
 ) -> Unknowns:
-    """What is sought, around the bodies and sensors as they were given."""
+    """Unknowns of the fit, around the bodies and sensors as they were given."""
     question = task.question
     unknowns = unknowns_of(
         task.bodies.on_host,
@@ -880,7 +906,7 @@ def _fields(
 def _conventions(
     task: _Task, best: Fit, effort: Effort
 ) -> Generator[Request, Minimum, Bool[np.ndarray, " conventions"]]:
-    """In which other conventions the record would fit; in none if it is not far."""
+    """Whether each other convention would fit; all False if the fit is not far off."""
     found = np.zeros(conventions.COUNT, bool)
     if not conventions.is_far(best):
         return found

@@ -28,7 +28,7 @@ from jrigid.identify._quality import GATE, Fit
 from jrigid.identify._sensors import Gyro
 
 # Standard errors of a number beyond which it is no chance.
-_SURE = 6.0
+_NO_CHANCE = 6.0
 # Part of what the fit does not explain, for an error of the gyroscope to be named.
 _EXPLAINED = 0.5
 # Part of the square of the rates' changes that free rotation must explain. Where a
@@ -56,7 +56,7 @@ class GyroError(NamedTuple):
 
     @property
     def gained(self) -> float:
-        """By how much it lowers chi-square more than one number does by chance."""
+        """Fall of chi-square, less what all but one of its numbers cause by chance."""
         # In noise each number lowers chi-square by 1 in the mean.
         return self.deviations**2 - (self.value.size - 1)
 
@@ -97,7 +97,7 @@ def _is_sure(error: GyroError, chi_square: float, freedom: float) -> bool:
     # Noise alone makes chi-square as large as this.
     chance = freedom + GATE * math.sqrt(2 * max(freedom, 1.0))
     explains = error.deviations**2 > _EXPLAINED * (chi_square - chance)
-    return error.deviations > _SURE and explains
+    return error.deviations > _NO_CHANCE and explains
 
 
 def gyro_errors(fit: Fit, noise: float) -> GyroErrors:
@@ -158,7 +158,7 @@ def _effects(fit: Fit, index: int, gyro: Gyro, noise: float) -> dict[str, np.nda
 def _changes(
     fit: Fit, index: int, gyro: Gyro, offset: np.ndarray, used: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What errors of a gyroscope do to its readings (trials, samples, 3, numbers).
+    """Effects of errors of a gyroscope on its readings (trials, samples, 3, numbers).
 
     Args:
         fit: Where the search ended.
@@ -198,7 +198,7 @@ def _matrix(gyro: Gyro) -> np.ndarray:
 def _derivatives(
     tensor: np.ndarray, rates: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivatives of the rates of a free body, by Euler's equations."""
+    """First and second derivatives of a free body's rates, by Euler's equations."""
     # A fit may end at a body without a third moment.
     inverse = np.linalg.pinv(tensor)
     momentum = rates @ tensor
@@ -328,7 +328,7 @@ def _table(fit: Fit, effects: dict[str, np.ndarray]) -> _Table:
 
 
 def _independent(fit: Fit, residual: np.ndarray) -> np.ndarray:
-    """What a change of the predictions does to the independent rows."""
+    """Change of the independent rows that a change of the predictions causes."""
     if not fit.problem.options.dense:
         return residual
     minimum = fit.minimum

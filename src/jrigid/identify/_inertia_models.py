@@ -417,7 +417,7 @@ class LogCholesky(AbstractInertiaModel):
         self.parameters = findings.guard(parameters, throw=True)
 
     @property
-    def names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def names(self) -> tuple[str, ...]:
         """Names of the numbers that are not frozen."""
         return tuple(name for name in LOG_CHOLESKY if name not in self.frozen)
 

@@ -58,7 +58,7 @@ def systems_of(system: Any, trials: int) -> tuple[RigidBody, ...]:
 
 
 def _padded(systems: tuple[RigidBody, ...]) -> tuple[RigidBody, ...]:
-    """With samples of one length where those of trials differ."""
+    """The systems, with samples padded to one length where those of trials differ."""
 
     def is_sampled(x: object) -> bool:
         return isinstance(x, Sampled)
@@ -110,7 +110,8 @@ def start_of(start: Any, trials: int) -> tuple[Any, State | None, Any]:
     tensor = None
     if inertia is not None:
         tensor = as_tensor(array_of_shape("start", inertia, *INERTIA))
-    return tensor, state, internal  # type: ignore[return-value]
+    # pyright does not know that `demand` has refused what is not a State.
+    return tensor, state, internal  # pyright: ignore[reportReturnType]
 
 
 def refuse(
@@ -212,7 +213,7 @@ def result_of_start(
 def findings_of_start(
     systems: tuple[RigidBody, ...], tensor: Any, state: State | None
 ) -> Findings:
-    """What is wrong with the values of the systems and of `start`."""
+    """Findings about the values of the systems and of `start`."""
     findings = Findings()
     for system in systems:
         system.check(findings)
@@ -229,7 +230,7 @@ def findings_of_start(
 def findings_of_records(
     records: tuple[Record, ...], readings: DirectReadings | None
 ) -> Findings:
-    """What is wrong with records, whose arrays are numpy's."""
+    """Findings about records, whose arrays are numpy's."""
     findings = Findings()
     check_records(findings, records)
     # Attitudes may be sampled sparsely: their aliases are looked for by several
@@ -273,7 +274,7 @@ def judge(
 
 
 class _Judged(NamedTuple):
-    """What `settle` looks at."""
+    """Object with a result code, the only part that `settle` reads."""
 
     result: Any
 

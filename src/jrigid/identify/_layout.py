@@ -1,4 +1,4 @@
-"""How a record is divided into segments, and the states at which they begin."""
+"""Division of a record into segments, and the states at which they begin."""
 
 import math
 from typing import NamedTuple

@@ -16,7 +16,7 @@ from jrigid.identify._filter import TrialLikelihoods, likelihood
 from jrigid.identify._layout import Layout
 from jrigid.identify._quality import Fit, columns_of_prior, linearised, weights_of
 
-FAINT = 1e-4  # part of the first level below which there is no torque
+NO_LEVEL = 1e-4  # part of the first level below which there is no torque
 _DIFFERENCE = 0.1  # of logarithms, for second derivatives
 _LONGEST_MOVE = 3.0  # of logarithms
 _FINE = 0.02  # change of a logarithm that does not matter
@@ -25,8 +25,8 @@ _TRIED_FRACTIONS = (1.0, 0.3, 0.1, 0.01)  # of a step
 _UNKNOWN = 10.0  # error of the logarithm of a level that could have any size
 _HIGHEST = 30.0  # logarithm of a level, in units of the first, above all real ones
 _TRIED = 2.0  # logarithm of the first time tried, in units of the shortest
-# What a number costs, in -2 log likelihood. With Akaike's cost of 2 one of seven records
-# under equal levels seems to have three, whose errors are then too small.
+# What a number costs, in -2 log likelihood. With Akaike's cost of 2 one of seven
+# records under equal levels seems to have three, whose errors are then too small.
 _COST = 4.0
 # A trial has another body if -2 log likelihood falls by more than this, beyond one for
 # each number, where it has numbers of its own. Few trials do not show which of them it
@@ -39,7 +39,7 @@ _PRECISION_OF_SIZES = 1 / 0.7**2
 
 
 class Form(NamedTuple):
-    """How many numbers a torque has.
+    """Counts of the numbers that describe a torque.
 
     Attributes:
         levels: 1 for all axes together, or 3.
@@ -51,7 +51,7 @@ class Form(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers there are."""
+        """Count of all numbers."""
         return self.levels + self.times
 
     def contains(self, other: "Form") -> bool:
@@ -83,7 +83,7 @@ class Torque(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers were sought, with the sizes of trials if they were."""
+        """Count of the numbers sought, with the sizes of trials if they were sought."""
         return self.form.size + (self.trials.size if self.own_sizes else 0)
 
     @property
@@ -286,7 +286,7 @@ class Search:
     def bounds(self, form: Form) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the numbers of a form."""
         counts = [form.levels, form.times]
-        low = np.repeat([self._first + np.log(FAINT), self._shortest], counts)
+        low = np.repeat([self._first + np.log(NO_LEVEL), self._shortest], counts)
         high = np.repeat([self._first + _HIGHEST, self._longest], counts)
         return low, high
 
@@ -304,11 +304,11 @@ class Search:
         return torque._replace(numbers=numbers, minus_two_log_likelihood=value)
 
     def are_faint(self, torque: Torque) -> np.ndarray:
-        """Which levels are too low to be detected."""
-        return torque.levels < 2 * FAINT * np.exp(self._first)
+        """Whether each level is too low to be detected."""
+        return torque.levels < 2 * NO_LEVEL * np.exp(self._first)
 
     def are_unbounded(self, torque: Torque, errors: np.ndarray) -> np.ndarray:
-        """Which levels are large and may be much larger, by errors of logarithms."""
+        """Whether levels are large and may be much larger, by errors of logarithms."""
         return (torque.levels > np.exp(self._first)) & ~(errors < _UNKNOWN)
 
     def preferred(self, torque: Torque, fit: Fit, spins: np.ndarray) -> Torque:
@@ -373,7 +373,7 @@ class Search:
         )
 
     def foreign(self, torque: Torque, fit: Fit) -> np.ndarray:
-        """Which trials have another body, as far as their likelihood shows."""
+        """Whether each trial has another body, as far as its likelihood shows."""
         used = np.any(fit.kept > 0, axis=1)
         none = np.zeros(used.shape, bool)
         numbers = fit.minimum.point.numbers.size
@@ -430,7 +430,7 @@ def _with_sizes(torque: Torque, likelihood: Likelihood) -> Function:
 
 
 def _cost_of_sizes(function: Function, x: np.ndarray, trials: int) -> float:
-    """What sizes of trials cost in -2 log likelihood, by Laplace's method."""
+    """Cost of the sizes of trials in -2 log likelihood, by Laplace's method."""
     # Trials hardly depend on each other: moving all shows the curvature of each.
     move = np.zeros(x.size)
     move[-trials:] = _DIFFERENCE

@@ -48,7 +48,7 @@ _Vmap = Callable[[Callable[..., _Tree]], Callable[..., _Tree]]
 
 
 class Settings(NamedTuple):
-    """What one minimisation is to do.
+    """Settings of one minimisation.
 
     Attributes:
         kept: 1 for each sample that takes part, 0 for one that does not (trials,
@@ -78,7 +78,7 @@ class Settings(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended.
+    """Point at which a minimisation ended.
 
     Attributes:
         point: Numbers and states.
@@ -205,7 +205,7 @@ def _robust_weights(
 def push_over(
     problem: Problem, layout: Layout, numbers: Array, settings: Settings
 ) -> Push:
-    """What the unmodelled torque may add from one segment to the next."""
+    """Change that the unmodelled torque may add from one segment to the next."""
     if problem.options.dense:
         return push_of(
             settings.disturbance,

@@ -92,7 +92,8 @@ def optimal_trial(
         keep each time near its initial value.
 
     Raises:
-        ValueError: The number of limits is not the number of arrays, or a limit is none.
+        ValueError: The number of limits is not the number of arrays, or a limit is
+            none.
         RuntimeError: The score is not finite at any of the initial plans.
 
     Gradients: none.
@@ -260,7 +261,7 @@ def _chosen(
 
 
 class _Descent(NamedTuple):
-    """Where a search is.
+    """Point that a search has reached, with its slope and its next step.
 
     Attributes:
         x: The vector of chosen arrays.

@@ -1,4 +1,4 @@
-"""What independent rows determine of the numbers and of each trial's state.
+"""Precision of the numbers and of each trial's state, from independent rows.
 
 Plain numpy, on the host: small matrices, once for each fit.
 """
@@ -26,7 +26,7 @@ _OF_TURN = 100.0
 
 
 class Precision(NamedTuple):
-    """What rows determine of the numbers.
+    """Precision with which rows determine the numbers.
 
     Attributes:
         values: Singular values of the derivatives in natural units, descending; the
@@ -198,7 +198,7 @@ def reduced(fit: Fit) -> Reduced:
 
 @quality.once_for_each_fit
 def precision(fit: Fit) -> Precision:
-    """What a fit determines of the numbers."""
+    """Precision with which a fit determines the numbers."""
     units = fit.minimum.units
     found = precision_of(reduced(fit), units)
     # Rounding leaves less than this of a direction that the record does not show.

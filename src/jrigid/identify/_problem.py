@@ -29,11 +29,11 @@ from jrigid.systems import RigidBody
 # Tolerance of the integration of a whole record, by the size of the dtype in bytes.
 RTOL = {8: 1e-9, 4: 1e-5}
 # Standard deviations beyond a limit, where a saturated reading no longer matters.
-_SURE = 6.0
+_DEEPEST = 6.0
 
 
 class Options(NamedTuple):
-    """What is fixed when a fit is compiled.
+    """Options that are fixed when a fit is compiled.
 
     Attributes:
         free_motion: Whether no torque acts.
@@ -68,7 +68,7 @@ class Options(NamedTuple):
 
     @property
     def local(self) -> int:
-        """How many numbers a change of the state has: rates, and a turn if needed."""
+        """Size of a change of the state: three rates, and three of a turn if needed."""
         return 6 if self.depends_on_attitude else 3
 
 
@@ -82,7 +82,7 @@ class Problem(eqx.Module):
 
     @property
     def known(self) -> int:
-        """How many rows a trial has besides its samples.
+        """Number of rows that a trial has besides its samples.
 
         First come those for prior knowledge of the trial's own numbers. Those for all
         trials follow and count in the first trial only: prior knowledge of the numbers,
@@ -93,7 +93,7 @@ class Problem(eqx.Module):
         return known + (unknowns.hold is not None) + self.held
 
     def priors(self, trials: int) -> int:
-        """How many residuals of prior knowledge there are, of so many trials.
+        """Number of residuals of prior knowledge, of so many trials.
 
         A direction that is held is none: it restricts the numbers.
         """
@@ -104,7 +104,7 @@ class Problem(eqx.Module):
 
     @property
     def held(self) -> int:
-        """How many rows hold a fit near its start while part of the record is used.
+        """Number of rows that hold a fit near its start on a part of the record.
 
         They are those of all numbers but the inertia's: a few samples say little of
         a scale, which could go anywhere.
@@ -113,7 +113,7 @@ class Problem(eqx.Module):
 
 
 class _Trial(NamedTuple):
-    """What belongs to one trial: (nodes, ...), (samples, ...)."""
+    """Data of one trial: (nodes, ...), (samples, ...)."""
 
     layout: Layout
     samples: Samples
@@ -228,7 +228,7 @@ class SimulatedWithParts:
         return isinstance(other, SimulatedWithParts) and self._key == other._key
 
     def __hash__(self) -> int:
-        """By the state of the parts."""
+        """Hash of the state of the parts."""
         return hash(self._key)
 
     def __call__(
@@ -382,7 +382,7 @@ def _unlikely(rows: Array, sign: Array) -> Array:
     The square of such a residual is -2 log of the probability that noise takes the
     reading beyond the limit.
     """
-    beyond = jnp.where(sign != 0, jnp.clip(sign * rows, -1e3, _SURE), 0.0)
+    beyond = jnp.where(sign != 0, jnp.clip(sign * rows, -1e3, _DEEPEST), 0.0)
     # In float64 and in float32 the bounds of `beyond` keep the root and its slope
     # finite.
     size = jnp.sqrt(-2 * jax.scipy.special.log_ndtr(beyond))
@@ -537,7 +537,7 @@ def over_trials(
     first = jnp.zeros(layout.start.shape[0], layout.ts.dtype).at[0].set(1)
     trials = _Trial(layout, problem.samples, first)
     # All trials share the numbers.
-    axes_of_point: Any = Point(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+    axes_of_point: Any = Point(None, 0, 0, 0, 0)
 
     def over(point: Point, *changes: Array) -> Any:
         axes = axes_of_point, stacked, 0, *(0 for _ in changes)
@@ -564,7 +564,7 @@ def evaluation(
     problem: Problem, layout: Layout
 ) -> Callable[[Point], tuple[Rows, Links]]:
     """Rows and links at a point, with derivatives in the border and the states."""
-    # `inlined` halves the time that tracing under nested vmaps takes. It drops rules for
-    # derivatives, of which none are taken from here on.
+    # `inlined` halves the time that tracing under nested vmaps takes. It drops rules
+    # for derivatives, of which none are taken from here on.
     one = partial(inlined, partial(_linearised, problem))
     return over_trials(one, problem, layout)

@@ -1,4 +1,4 @@
-"""How well a fit describes its record: scales, outliers, misfits and boundaries.
+"""Quality of a fit: scales, outliers, misfits and boundaries.
 
 Plain numpy, on the host.
 """
@@ -35,7 +35,8 @@ class Probe(NamedTuple):
 
     Attributes:
         tensor: Of that body.
-        distance: From the fit, in standard errors: the root of the growth of chi-square.
+        distance: From the fit, in standard errors: the root of the growth of
+            chi-square.
         error: Of the direction held, in natural units, as this probe shows it.
     """
 
@@ -119,7 +120,7 @@ def linearised(fit: Fit) -> Linearised:
 
 
 def columns_of_prior(fit: Fit) -> np.ndarray:
-    """What is known beforehand, as columns of innovations.
+    """Prior knowledge as columns of innovations.
 
     Returns:
         Columns (trials, known, degrees, columns): residual, state, border.
@@ -140,7 +141,7 @@ def of_samples(problem: Problem, of_records: np.ndarray) -> np.ndarray:
 
 
 def scales_of(problem: Problem, residual: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """By how much residuals exceed the noise, in the median, of each record.
+    """Size of each record's residuals over the noise, from their median.
 
     At least 1 where the noise is known.
     """
@@ -154,7 +155,7 @@ def scales_of(problem: Problem, residual: np.ndarray, kept: np.ndarray) -> np.nd
 def without_outliers(
     problem: Problem, residual: np.ndarray, kept: np.ndarray, scales: np.ndarray
 ) -> np.ndarray:
-    """Which samples are kept of those that were, by how far off they are."""
+    """`kept` without outliers, and without trials that have many of them."""
     width = np.sum(problem.samples.weight, axis=-1)
     square = np.sum(residual**2, axis=-1)
     good = square / of_samples(problem, scales**2) < width + _REJECTED
@@ -253,7 +254,7 @@ def misfit(fit: Fit) -> float:
 
 
 def signal_of(problem: Problem, weight: np.ndarray) -> np.ndarray:
-    """What is to be explained, in units of the noise.
+    """Signal that a fit should explain, in units of the noise.
 
     It is a radian for attitudes and directions, and the variation of values for others.
     """

@@ -63,7 +63,7 @@ class DirectReadings(NamedTuple):
 
 
 class _Series(NamedTuple):
-    """What one sensor reads directly: times, whether there is a reading, values."""
+    """Direct readings of one sensor: times, whether there is a reading, values."""
 
     ts: np.ndarray
     valid: np.ndarray
@@ -140,7 +140,7 @@ def _rates_from_attitudes(
 
 
 def _reach(ts: np.ndarray, attitude: np.ndarray) -> int:
-    """How many samples to each side tell a rate best; 0 where neighbours do.
+    """Samples to each side that give the best rate; 0 where neighbours do.
 
     The turns to them must be small and follow a parabola as well as those to the
     nearest samples do, whose residuals are noise.
@@ -264,7 +264,7 @@ def _apply_method(sensor: AbstractSensor, name: Static, values: AnyArray) -> jax
 def _first_series(
     records: tuple[Record, ...], samples: Samples, name: str
 ) -> _Series | None:
-    """What the first record reads that has "rates" or "attitude"; None without one."""
+    """Readings of the first record with "rates" or "attitude"; None without one."""
     for record, values, part in zip(
         records, samples.values, samples.parts, strict=True
     ):
@@ -299,7 +299,7 @@ def _without_leaps(series: _Series, leaps: _Leaps, fewest: int) -> _Series:
 
 
 def _lone(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Which attitudes leap from the path of those before and after them."""
+    """Whether each attitude leaps from the path of those before and after it."""
     span = t[2:] - t[:-2]
     part = (t[1:-1] - t[:-2]) / np.where(span > 0, span, 1.0)
     turn = log(multiply(conjugate(q[:-2]), q[2:]))
@@ -313,7 +313,7 @@ def _lone(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _turned_far(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Which attitudes are far from most of those around them."""
+    """Whether each attitude is far from most of those around it."""
     offsets = np.delete(np.arange(-_AROUND, _AROUND + 1), _AROUND)
     # At the ends the samples inside stand for those that are missing.
     other = np.arange(t.size)[:, None] + offsets
@@ -324,7 +324,7 @@ def _turned_far(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _leaping(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Which rates leap from the medians of those around them."""
+    """Whether each rate leaps from the median of those around it."""
     del t
     off = np.max(np.abs(rates - _running_median(rates, _AROUND)), axis=1)
     # A body may turn slower and slower, so that rates are compared with those nearby.

@@ -1,4 +1,4 @@
-"""Why a fit does not describe its record, and what to pass instead.
+"""Reasons why a fit does not describe its record, and what to pass instead.
 
 One sentence for the first line of a report: a unit, a noise, an error of the sensor
 that is not sought, or something that swings.
@@ -28,13 +28,20 @@ _NEARLY_A_SPHERE = 1.03
 # Radians of a swing while the body turns by one: no free body does that.
 _TOO_FAST = 3.0
 _LOUD = 0.2  # part of the power that a swing has at its frequency
+# Periods of a swing in a record. The trend of a shorter one looks like a period of it.
+_FEWEST_PERIODS = 2
 # Difference of chi-square within which two errors of a gyro explain about as much.
-_LIKE = 16.0
+_ABOUT_AS_MUCH = 16.0
 _OTHER_FIELD = 1.5  # times the size of a field: readings that are not of it
 _MUCH_LEFT = 0.05  # of the square of a record, by a fit that follows it
-_WHITE = 0.1  # correlation of neighbours
-_WHITE_SURE = 5.0  # standard deviations of that
+CORRELATED = 0.1  # correlation of neighbours
+SURELY_CORRELATED = 5.0  # standard deviations of that
 _FEWEST = 16  # samples whose spectrum says something
+# Trials with so many times the chi-square of the others may be of another body. Few
+# trials do not show it, nor do trials of which many differ.
+_FAR_ABOVE_OTHERS = 5.0
+_FEWEST_TRIALS = 5
+_MOST_STRANGE = 0.25
 # Readings at the largest value of an axis that show a limit: so many, and so many times
 # as many as at the next value, since coarse readings repeat theirs.
 _AT_LIMIT = 8
@@ -53,16 +60,17 @@ def reason(result: FitResult) -> str:
 
 
 def _reason(result: FitResult) -> str:
-    """What is wrong first of all."""
+    """The first reason why a fit does not describe its record."""
     if result.status == Status.BAD_INPUT:
         return (
-            f"{RESULTS[result.diagnostics.input_result]} The error that a fit raises by "
-            "default says which argument it is."
+            f"{RESULTS[result.diagnostics.input_result]} The error that a fit raises "
+            "by default says which argument it is."
         )
     if _lacks_predictions(result):
         return (
-            "Predictions are not finite at the initial values: `predict` of each sensor "
-            "must be finite wherever there is a reading, and `simulate` from `start`."
+            "Predictions are not finite at the initial values: `predict` of each "
+            "sensor must be finite wherever there is a reading, and `simulate` from "
+            "`start`."
         )
     of_conventions = conventions.in_words(np.asarray(result.diagnostics.conventions))
     if of_conventions:
@@ -73,7 +81,8 @@ def _reason(result: FitResult) -> str:
             "step, or a motion of your own (`motion`, and `start`)."
         )
     if _is_at_rest(result):
-        return (
+        # A noise that is far too large hides any motion.
+        return _of_noise(result) or (
             "The body does not turn: the readings are no larger than their noise. "
             "Inertia shows in rates that change."
         )
@@ -96,7 +105,8 @@ def _reason(result: FitResult) -> str:
             "or whose times are not in seconds. Multiply rates in deg/s by pi / 180."
         )
     if result.status == Status.OK:
-        return _of_parameters(result)
+        sentences = [_of_parameters(result), _of_innovations(result)]
+        return " ".join(filter(None, sentences))
     if result.status == Status.UNIDENTIFIABLE and _may_turn_the_other_way(result):
         return (
             "Attitudes at equal intervals are also those of a body that turns the "
@@ -111,7 +121,9 @@ def _reason(result: FitResult) -> str:
         _of_limit(result)
         or _of_field(result)
         or _of_gyro(result)
-        or " ".join(filter(None, [_of_noise(result), _of_minimum(result)]))
+        or " ".join(
+            filter(None, [_of_scale(result), _of_noise(result), _of_minimum(result)])
+        )
     )
 
 
@@ -147,7 +159,7 @@ def _of_clocks(result: FitResult) -> str:
 
 
 def _of_field(result: FitResult) -> str:
-    """A sentence about a magnetometer whose field has another size than the readings."""
+    """Describe a magnetometer whose field has another size than the readings."""
     is_biased = any("magnetometer.bias" in x.name for x in result.unknowns.sought)
     for sensor, values in _readings_of(result):
         if not isinstance(sensor, Magnetometer) or is_biased:
@@ -162,8 +174,22 @@ def _of_field(result: FitResult) -> str:
     return ""
 
 
+def _of_scale(result: FitResult) -> str:
+    """A sentence about a tensor whose trace was held beside a torque of known size."""
+    options = result.problem.options
+    unknowns = result.unknowns
+    is_held = not (unknowns.scaled or unknowns.inertia_model.absolute)
+    is_sought = any(x.name.startswith("torque") for x in unknowns.sought)
+    if result.status == Status.OK or options.free_motion or is_sought or not is_held:
+        return ""
+    return (
+        "The trace of the tensor is held at that of the body which was given. If it "
+        'is not known, but the torque is, pass `scale="known"`.'
+    )
+
+
 def _of_minimum(result: FitResult) -> str:
-    """What to try where the search may have ended in a wrong minimum."""
+    """Advice where the search may have ended in a wrong minimum."""
     failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
     is_misfit = result.status == Status.MISFIT
     unexplained = float(result.diagnostics.unexplained)
@@ -209,7 +235,7 @@ def _of_gyro(result: FitResult) -> str:
     sentences = [
         _of_gyro_error(name, error.value)
         for name, error in named.items()
-        if error.gained > most - _LIKE
+        if error.gained > most - _ABOUT_AS_MUCH
     ]
     if len(sentences) > 1:
         sentences.append("The record hardly tells which of them it is.")
@@ -314,14 +340,31 @@ def _is_noise(result: FitResult, rates: np.ndarray) -> bool:
 
 
 def _of_parameters(result: FitResult) -> str:
-    """Which arrays beside the inertia are not determined."""
+    """Name the arrays beside the inertia that are not determined."""
     verdicts = result.determined.items()
     names = [name for name, is_determined in verdicts if not is_determined]
     return f"It does not determine {', '.join(names)}." if names else ""
 
 
+def _of_innovations(result: FitResult) -> str:
+    """A sentence about an estimated torque that stands for noise of the sensor.
+
+    Noise changes its sign from reading to reading, which no torque does.
+    """
+    like, deviations = result.diagnostics.whiteness
+    if like > -CORRELATED or deviations < SURELY_CORRELATED:
+        return ""
+    if not (result.problem.options.dense and result.problem.options.noise_known):
+        return ""
+    return (
+        f"The innovations of neighbours correlate by {like:.2f}, as if noise of the "
+        "sensor were taken for a torque: `sigma` is too small. Pass the noise of the "
+        "sensor, or none."
+    )
+
+
 def _chi_square(result: FitResult) -> float:
-    """Chi-square in units of the noise, which has the size of the residuals if unknown."""
+    """Chi-square in units of the noise; an unknown noise is that of the residuals."""
     known = result.problem.options.noise_known
     return float(result.chi_square if known else result.degrees_of_freedom)
 
@@ -344,7 +387,7 @@ def _swing(result: FitResult) -> float:
     power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
     peak = int(np.argmax(power))
     # In noise about a constant rate no frequency stands out.
-    if power[peak] < _LOUD * np.sum(power):
+    if peak < _FEWEST_PERIODS or power[peak] < _LOUD * np.sum(power):
         return 0.0
     # n samples stand for n steps, one more than lie between the first and the last. A
     # gap in the samples matters little beside a factor of 57.
@@ -353,52 +396,91 @@ def _swing(result: FitResult) -> float:
     return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
 
 
+def _of_trials(result: FitResult) -> str:
+    """A sentence about a few trials with far larger residuals than the others."""
+    by_trial = np.asarray(result.diagnostics.chi_square_by_trial, float)
+    takes_part = ~np.asarray(result.rejected_trials)
+    if np.sum(takes_part) < _FEWEST_TRIALS:
+        return ""
+    usual = float(np.median(by_trial[takes_part]))
+    large = takes_part & (by_trial > _FAR_ABOVE_OTHERS * usual)
+    if not 0 < np.sum(large) <= _MOST_STRANGE * by_trial.size:
+        return ""
+    least = float(np.min(by_trial[large])) / usual
+    names = ", ".join(map(str, np.flatnonzero(large)))
+    advice = '`loss="robust"` leaves such trials out.'
+    if result.problem.options.robust:
+        advice = "Fit the others without them."
+    return (
+        f"Chi-square of trial {names} (from 0) is {least:.2g} times that of the "
+        f"others: it may be of another body. {advice}"
+    )
+
+
 def _of_noise(result: FitResult) -> str:
-    """What residuals of another size, or of a colour, say."""
-    if not (result.status == Status.MISFIT and result.problem.options.noise_known):
+    """Explain residuals that are not of the stated size, or that are coloured."""
+    if not result.problem.options.noise_known:
         return ""
     square = float(result.reduced_chi_square)
     # The mean square of n white residuals scatters by sqrt(2 / n).
     chance = GATE * math.sqrt(2 / max(int(result.degrees_of_freedom), 1))
-    size = math.sqrt(square)
-    residuals = f"The residuals are {size:.3g} times the stated noise"
-    if square < 1 - chance:
-        degrees = ""
-        # The noise in radians over the same noise in degrees is pi / 180 = 0.017.
-        if 0.01 < size < 0.03:
-            degrees = " (it is 57 times too large if it is in degrees)"
-        unit = "in the unit of the readings"
-        if all(isinstance(x, Gyro) for x in result.fitted()[1:]):
-            unit = "in rad/s"
-        return (
-            f"{residuals}: `sigma` is too large{degrees}. Pass the noise of the sensor "
-            f"{unit}."
-        )
+    residuals = f"The residuals are {math.sqrt(square):.3g} times the stated noise"
+    # A plan has no residuals.
+    if 0 < square < 1 - chance:
+        return f"{residuals}: {_too_large(result)}"
+    is_misfit = result.status == Status.MISFIT
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
+    like, deviations = result.diagnostics.whiteness
+    is_coloured = like > CORRELATED and deviations > SURELY_CORRELATED
+    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
+    if (
+        failed
+        and not is_coloured
+        and not stands_out(band, sure)
+        and square > 1 + chance
+    ):
+        return f"{residuals}, and white: {_too_small(result)}"
+    if not is_misfit:
+        return ""
+    of_trials = _of_trials(result)
+    if of_trials:
+        return of_trials
     if stands_out(band, sure):
         return (
             f"The residuals have {band:.2g} times their mean power in one band of "
             "frequencies: something that changes slowly, or swings, is missing. See "
             "`unmodelled` and `free`."
         )
-    like, deviations = result.diagnostics.whiteness
-    if like > _WHITE and deviations > _WHITE_SURE:
+    if is_coloured:
         return (
             f"{residuals}, and neighbours correlate by {like:.2f}: see `unmodelled` "
             "and `free`."
         )
-    if square <= 1 + chance:
-        if len(result.kept) == 1:
-            return ""
-        return (
-            "Trials differ by more than their errors say: they may be of different "
-            "bodies."
-        )
+    if square > 1 + chance:
+        return f"{residuals}, and white: {_too_small(result)}"
+    if len(result.kept) == 1:
+        return ""
+    return (
+        "Trials differ by more than their errors say: they may be of different bodies."
+    )
+
+
+def _too_large(result: FitResult) -> str:
+    """Advice on what to pass instead of a noise that is too large."""
+    degrees = ""
+    # The noise in radians over the same noise in degrees is pi / 180 = 0.017.
+    if 0.01 < math.sqrt(result.reduced_chi_square) < 0.03:
+        degrees = " (it is 57 times too large if it is in degrees)"
+    unit = "in the unit of the readings"
+    if all(isinstance(x, Gyro) for x in result.fitted()[1:]):
+        unit = "in rad/s"
+    return f"`sigma` is too large{degrees}. Pass the noise of the sensor {unit}."
+
+
+def _too_small(result: FitResult) -> str:
+    """Advice on what to pass instead of a noise that is too small."""
     otherwise = ", or `absolute_sigma=False`"
     if result.problem.priors(len(result.kept)):
         # A noise that is only relative cannot be weighed against what is known.
         otherwise = ""
-    return (
-        f"{residuals}, and white: `sigma` is too small. Pass the noise of the sensor"
-        f"{otherwise}."
-    )
+    return f"`sigma` is too small. Pass the noise of the sensor{otherwise}."

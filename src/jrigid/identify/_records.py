@@ -30,12 +30,12 @@ Noise = Real[_ArrayLike, "..."] | None
 class Record(Readable):
     """Times, values and noise of one sensor, in one trial or in several.
 
-    NaN, infinity, or an entry that numpy masks, stands for "not seen". It may stand in a
-    component of `values`, in a whole row, or in `ts` and its row (padding, which brings
-    trials to one length). Then that number is left out, or the whole sample where its
-    components belong together: in attitudes, in directions and beside a `covariance`.
-    What was not seen weighs nothing, and its `sigma` may be NaN. It costs as much time
-    as any sample.
+    NaN, infinity, or an entry that numpy masks, stands for "not seen". It may stand in
+    a component of `values`, in a whole row, or in `ts` and its row (padding, which
+    brings trials to one length). Then that number is left out, or the whole sample
+    where its components belong together: in attitudes, in directions and beside a
+    `covariance`. What was not seen weighs nothing, and its `sigma` may be NaN. It costs
+    as much time as any sample.
 
     Attributes:
         sensor: What showed the values.
@@ -111,7 +111,7 @@ class Record(Readable):
 
     @property
     def known(self) -> AnyArray:
-        """Which numbers of the residual were seen."""
+        """Whether each number of the residual was seen."""
         xp = self.values.__array_namespace__()
         is_finite = xp.isfinite(self.values) & xp.isfinite(self.ts)[..., None]
         if self.sensor.degrees is None and self.covariance is None:
@@ -122,7 +122,7 @@ class Record(Readable):
         return xp.repeat(whole, self.degrees, axis=-1)
 
     def with_values(self, values: Array) -> "Record":
-        """With other values, where there are times."""
+        """The record with other values, where there are times."""
         values = jnp.where(jnp.isfinite(self.ts)[..., None], values, jnp.nan)
         return eqx.tree_at(lambda x: x.values, self, values)
 
@@ -194,7 +194,7 @@ def _covariance(covariance: Any, shape: tuple[int, ...], of: str) -> Array:
 
 
 def _repeated(x: Array, shape: tuple[int, ...]) -> Array:
-    """Broadcast; without a compiled program where the numbers are known."""
+    """Broadcast, without a compiled program where the numbers are known."""
     if not is_concrete(x):
         return jnp.broadcast_to(x, shape)
     return jnp.asarray(np.broadcast_to(np.asarray(x), shape))
@@ -294,7 +294,7 @@ def Observed(
 
 
 def one_after_another(sizes: Iterable[int]) -> list[slice]:
-    """Where parts of these sizes are."""
+    """Slices of parts of these sizes, one after another."""
     ends = [0, *accumulate(sizes)]
     return list(map(slice, ends, ends[1:]))
 
@@ -326,12 +326,12 @@ class Samples(NamedTuple):
 
     @property
     def seen(self) -> AnyArray:
-        """Which samples are there."""
+        """Whether each sample was seen, at least in part."""
         return (self.weight > 0).any(axis=-1)
 
     @property
     def parts(self) -> list[slice]:
-        """Where each record's samples are."""
+        """Slice of each record's samples."""
         return one_after_another(x.shape[-2] for x in self.values)
 
 
@@ -458,7 +458,7 @@ def _arrays(record: Record) -> list[Any]:
 
 
 def _with_arrays(record: Record, arrays: list[Any]) -> Record:
-    """With other arrays, and a sensor that knows when the record begins."""
+    """The record with other arrays, and a sensor that knows when the record begins."""
     ts = arrays[0]
     times = np.asarray(ts) if is_concrete(ts) else ts
     xp = times.__array_namespace__()
@@ -494,7 +494,7 @@ def tells(record: Record, what: str) -> bool:
 
 
 def lengthened(record: Record) -> Record:
-    """With samples at its end in which nothing was seen; its arrays are numpy's."""
+    """The record with unseen samples added at its end; its arrays are numpy's."""
     more = rounded(record.ts.shape[-1]) - record.ts.shape[-1]
 
     def filled(x: Any, axis: int) -> Any:

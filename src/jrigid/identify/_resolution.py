@@ -1,4 +1,4 @@
-"""How accurately the steps of a fit follow the motion under a torque.
+"""Accuracy with which the steps of a fit follow the motion under a torque.
 
 A fit makes a fixed number of Runge-Kutta steps for each segment, without an error
 estimate. Its segments are parts of a turn, which suffices where the torque changes as

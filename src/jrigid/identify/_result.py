@@ -29,8 +29,8 @@ from jrigid.systems import RigidBody
 
 
 @with_codes
-class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a fit ended; `int` gives the code of one, `numpy.asarray` those of many."""
+class Status(Enumeration):
+    """Status of a fit; `int` gives the code of one, `numpy.asarray` those of many."""
 
     OK = "The fit describes the record, and the record determines the inertia."
     UNIDENTIFIABLE = (
@@ -40,7 +40,8 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     MISFIT = (
         "The fit follows the record, but its residuals are not the stated noise: a "
         "torque that the model has not, or a sensor's error (see `unmodelled`, "
-        "`free`), or the noise is not as stated. Errors are enlarged by larger residuals."
+        "`free`), or the noise is not as stated. Errors are enlarged by larger "
+        "residuals."
     )
     WRONG_BASIN = (
         "The fit does not describe the record: it ended in a wrong minimum, or the "
@@ -57,7 +58,7 @@ class Status(Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     BAD_INPUT = "The observations, or another argument, are not usable."
 
 
-_FAR = 1.0  # a change of a number beyond which the tensor is another one
+_ANOTHER_TENSOR = 1.0  # a change of a number beyond which the tensor is another one
 # In natural units: a direction with a larger error is not determined.
 LARGEST_ERROR = 0.3
 
@@ -87,7 +88,7 @@ def arrays_of(fields: dict[str, Any]) -> list[Any]:
 
 
 class Observations(NamedTuple):
-    """What was read in one record, an axis of trials in front.
+    """Values observed in one record, with an axis of trials in front.
 
     Attributes:
         times: [s]
@@ -211,7 +212,7 @@ class FitResult(eqx.Module):
 
     @property
     def unknowns(self) -> Unknowns:
-        """What the numbers mean: `unknowns.inertia(numbers)` is the tensor."""
+        """Meaning of the numbers: `unknowns.inertia(numbers)` is the tensor."""
         return self.problem.unknowns
 
     @property
@@ -223,7 +224,7 @@ class FitResult(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each of `numbers` is."""
+        """Name of each of `numbers`."""
         # The names follow from the shapes of the arrays in a single fit.
         first = (0,) * (self.numbers.ndim - 1)
         unknowns = jtu.tree_map(lambda x: x[first], self.unknowns)
@@ -290,7 +291,7 @@ class FitResult(eqx.Module):
 
     @property
     def ratios_intervals(self) -> Float[Array, "2 2"]:
-        """Limits of I2/I1 and I3/I1 at 95 %, in columns, lower first; see `interval`."""
+        """Limits of I2/I1 and I3/I1 at 95 % in columns, lower first; see `interval`."""
         # The index is an array of a pytree, so that both ratios share one compiled
         # program.
         ratios = [jtu.Partial(_one_of_moments, jnp.asarray(i)) for i in (3, 4)]
@@ -300,7 +301,7 @@ class FitResult(eqx.Module):
 
     @property
     def covariance(self) -> Float[Array, "*fits all all"]:
-        """Of `numbers`, then of each trial's state and own numbers."""
+        """Covariance of `numbers`, then of each trial's state and own numbers."""
         numbers = self.numbers_covariance
         diagnostics = self.diagnostics
         *lanes, trials, local, size = diagnostics.sensitivity.shape
@@ -569,7 +570,7 @@ class FitResult(eqx.Module):
 
     @property
     def null_directions(self) -> tuple[str, ...]:
-        """What the record does not tell, in words; of a single fit, outside of jit."""
+        """Undetermined quantities, in words; of a single fit, outside of jit."""
         demand_single(self)
         # `_words` imports this module.
         from jrigid.identify._words import null_directions
@@ -667,18 +668,19 @@ def sigma_points(
 
     Returns:
         Points (2 size + 1, numbers), the estimate last. Factors by which moves of a
-        function between them are too small, as no point is moved by more than `_FAR`.
+        function between them are too small, as no point is moved by more than
+        `_ANOTHER_TENSOR`.
     """
     xp = numbers.__array_namespace__()
     covariance = covariance[:size, :size]
     # A number that is not determined would leave the others no digits: it gets a unit
     # of its own.
-    unit = xp.maximum(errors_of(covariance) / _FAR, 1.0)
+    unit = xp.maximum(errors_of(covariance) / _ANOTHER_TENSOR, 1.0)
     values, axes = xp.linalg.eigh(covariance / (unit[:, None] * unit[None]))
     moves = unit[:, None] * axes * xp.sqrt(xp.maximum(values, 0.0) * size)[None]
     lengths = xp.sqrt(xp.sum(moves * moves, axis=0))
     # What is determined worse is continued as a straight line.
-    parts = xp.minimum(lengths, _FAR) / xp.where(lengths > 0, lengths, 1.0)
+    parts = xp.minimum(lengths, _ANOTHER_TENSOR) / xp.where(lengths > 0, lengths, 1.0)
     steps = xp.pad(moves * parts[None], ((0, numbers.size - size), (0, 0))).T
     still = xp.zeros_like(numbers)[None]
     points = numbers[None] + xp.concatenate([steps, -steps, still])

@@ -88,12 +88,14 @@ _THINNEST = -8.0
 _VAGUE = 3.0  # an error of such a logarithm that is more than a factor of size
 _FLAT = 1e-3  # least second moment of the body that the first attempt starts from
 _ROUND = 0.1  # ... that others start from, since the first led nowhere
-_FAR = 10.0  # of chi-square for each degree of freedom: a misfit worth other starts
+# Chi-square for each degree of freedom: a misfit worth other initial values.
+_MUCH_MISFIT = 10.0
 _PROBES = (-0.25, 0.25, -1.0, 1.0)  # natural units, along the weakest direction
 _WEAK = 0.01  # an error in natural units that is worth probes
 _HARD = 1e4  # weight of what a probe holds, in natural units
 _LEAST_GROWTH = 1e-6  # of chi-square at a probe: rounding may make it less
-_SURE = 36.0  # growth of chi-square, six standard errors, at which a probe is content
+# Growth of chi-square, six standard errors, at which a probe is content.
+_ENOUGH_GROWTH = 36.0
 _DISTINCT = 0.1  # natural units between two minima
 _BEYOND = 6.0  # standard errors from a fit that no error describes
 _BESIDE = 100  # steps to a minimum with another number of turns in a gap
@@ -144,7 +146,7 @@ class Stage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """How hard to try.
+    """Limits of a search, and a function that reports its progress.
 
     Attributes:
         max_steps: Of the last stage.
@@ -179,7 +181,7 @@ class Starts:
         self.unknowns, self._first = unknowns.start(tensors[0], _FLAT)
 
     def __len__(self) -> int:
-        """How many attempts there may be."""
+        """Number of attempts that are possible."""
         return len(self._tensors)
 
     def __getitem__(self, attempt: int) -> np.ndarray:
@@ -476,7 +478,7 @@ def _progress(stage: Stage, fit: Fit) -> str:
 
 
 def search(case: Case) -> Search:
-    """Through all stages; if that ends wrong, again, more slowly, from other numbers.
+    """Run all stages; if they fail, run them again, slower, from other numbers.
 
     Fisher's information at a minimum knows nothing of a valley that bends, nor of other
     minima. So a fit whose weakest direction is poorly determined is probed: that
@@ -597,7 +599,7 @@ def _lowest(fits: Sequence[Fit]) -> Fit:
 
 
 def _distance(one: Fit, other: Fit) -> float:
-    """How far apart the numbers of two fits are, in errors of the first for noise 1."""
+    """Distance between the numbers of two fits, in errors of the first for noise 1."""
     known = precision(one)
     change = other.minimum.point.numbers - one.minimum.point.numbers
     along = known.directions.T @ (change / one.minimum.units)
@@ -737,10 +739,10 @@ def no_search(case: Case) -> Search:
 def _attempts(
     case: Case, best: Fit, wrong: float, noise: float, ambiguous: bool
 ) -> int:
-    """How many attempts to make.
+    """Number of attempts to make.
 
-    Two of a misfit that follows the record, all of other failures. A coarse record has
-    many bodies that follow it, so its misfits are such failures.
+    A misfit that follows the record gets two, other failures get all. A coarse record
+    has many bodies that follow it, so its misfits are such failures.
     """
     count = len(case.starts)
     if is_pure(best, noise) and wrong < 0.5:  # no misfit
@@ -748,7 +750,7 @@ def _attempts(
     if ambiguous and wrong == 0:
         return 1
     if wrong > 0:
-        lost = wrong > _FAR or is_at_boundary(best)
+        lost = wrong > _MUCH_MISFIT or is_at_boundary(best)
         lost = lost or unexplained(best) > FOLLOWED
         return count if lost or case.coarse else min(2, count)
     return min(4, count) if case.coarse else 1
@@ -777,7 +779,7 @@ def _probed(case: Case, best: Fit, at: Weakest) -> Search:
         distance = float(np.sqrt(max(growth, _LEAST_GROWTH)))
         error = _error_by_probe(best, end, at.direction, step, distance)
         # Beyond six standard errors a probe says nothing of those that are stated.
-        if growth >= _SURE:
+        if growth >= _ENOUGH_GROWTH:
             sides_beyond.add(side)
             continue
         probes.append(Probe(end.minimum.tensor, distance, error))
@@ -807,7 +809,7 @@ def _error_by_probe(
     step: float,
     distance: float,
 ) -> float:
-    """In natural units, by how far the tensor moved: numbers are logarithms."""
+    """Error in natural units, by how far the tensor moved: numbers are logarithms."""
     tensor = best.minimum.tensor
     h = 1e-4
     near = best.minimum.point.numbers + h * np.stack([direction, -direction])
@@ -837,7 +839,7 @@ class _Call(NamedTuple):
         return self.results.square.is_ready()
 
     def answers(self) -> list[tuple[int, Minimum]]:
-        """What each search asked for; waits until the call has ended."""
+        """Minimum for each search that asked; waits until the call has ended."""
         minima = _of_lanes(self.results, len(self.indices))
         return list(zip(self.indices, minima, strict=True))
 
@@ -895,7 +897,7 @@ def run(searches: Iterable[Generator[Request, Minimum, _Value]]) -> list[_Value]
 
 
 def _shapes(request: Request) -> Any:
-    """Equal for requests that one compiled call can answer."""
+    """Key that is equal for requests that one compiled call can answer."""
     leaves, tree = jtu.tree_flatten(request)
     return tree, tuple(np.shape(x) for x in leaves)
 

@@ -413,7 +413,7 @@ class MomentumSensor(AbstractSensor):
 
     # A class variable in other sensors.
     @property
-    def depends_on_attitude(self) -> bool:  # pyright: ignore
+    def depends_on_attitude(self) -> bool:
         """Whether the values are those in space axes."""
         return self.frame == "space"
 
@@ -447,9 +447,7 @@ class FunctionSensor(AbstractSensor):
     width: ClassVar[int | None] = None
     function: Callable[[Any, Any, Any], Any]
     # A field here and a class variable in other sensors.
-    depends_on_attitude: bool = eqx.field(  # pyright: ignore
-        static=True
-    )
+    depends_on_attitude: bool = eqx.field(static=True)
 
     def __init__(
         self,

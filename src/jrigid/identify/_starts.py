@@ -167,9 +167,9 @@ def _rows_of_windows(
 def _samples(
     padded: bool, ts: Array, *columns: Array
 ) -> tuple[Findings, Array, list[Array]]:
-    """Of trials (trials, n): what is wrong, which samples are known, and their values.
+    """Findings about trials (trials, n), whether samples are known, and their values.
 
-    Values of the others are zero.
+    Values of unknown samples are zero.
     """
     findings = Findings()
     known = jnp.all(jnp.isfinite(jnp.concatenate(columns, axis=-1)), axis=-1)
@@ -186,7 +186,7 @@ def _samples(
 
 
 def _findings(padded: bool, *given: Array) -> Findings:
-    """What is wrong with samples."""
+    """Findings about samples."""
     return _samples(padded, *given)[0]
 
 
@@ -210,7 +210,7 @@ def _answer(
     padded: bool = False,
     **columns: Any,
 ) -> LinearEstimate:
-    """Of arguments checked and with an axis of trials in front."""
+    """Check the arguments, put an axis of trials in front of them, and solve."""
     shape = np.shape(ts)
     width = {"attitudes": 4}
     wanted = {name: (x, *shape, width.get(name, 3)) for name, x in columns.items()}
@@ -234,7 +234,7 @@ def _with_rows(rows: Array, unknowns: int) -> Array:
 
 
 def _null_vector(rows: Array) -> tuple[Array, Array]:
-    """Of unit trace; and the singular values."""
+    """Null vector of unit trace, and the singular values."""
     rows = _with_rows(rows, rows.shape[1])
     size = or_one(jnp.max(jnp.abs(jax.lax.stop_gradient(rows))))
     _, values, right = jnp.linalg.svd(rows / size, full_matrices=False)

@@ -107,7 +107,7 @@ def fields_of_torque(fit: Fit, inflation: float) -> dict[str, np.ndarray]:
 
 @quality.once_for_each_fit
 def added_by_torque(fit: Fit) -> np.ndarray:
-    """What the errors of an estimated torque add to the covariance of the numbers.
+    """Covariance that errors of an estimated torque add to that of the numbers.
 
     The covariance of a fit is that under its torque. Others are nearly as likely, and
     give other estimates and other errors: the variance of a number is the mean of its
@@ -142,7 +142,7 @@ def added_by_torque(fit: Fit) -> np.ndarray:
 
 
 def _precision_under(fit: Fit, torque: levels.Torque) -> Precision:
-    """What a fit would determine of the numbers if this torque acted."""
+    """Precision of the numbers that a fit would have if this torque acted."""
     units = fit.minimum.units
     disturbance = Disturbance(*(np.asarray(x, units.dtype) for x in torque.disturbance))
     rows, weight, _ = innovations_under(fit, disturbance)
@@ -155,6 +155,6 @@ def _to_best(known: Precision) -> np.ndarray:
 
 
 def _without_negative(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """The part of a symmetric matrix whose eigenvalues, in these units, are positive."""
+    """Part of a symmetric matrix whose eigenvalues, in these units, are positive."""
     values, axes = np.linalg.eigh(matrix / (units[:, None] * units))
     return (axes * np.maximum(values, 0.0)) @ axes.T * (units[:, None] * units)

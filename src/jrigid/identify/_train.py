@@ -85,7 +85,7 @@ class _Segments(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """What stays the same in all epochs.
+    """Parts of the training that stay the same in all epochs.
 
     Attributes:
         optimizer: Optimiser of the parameters.
@@ -431,7 +431,7 @@ def _first_states(readings: DirectReadings) -> State:
 
 
 class _AfterEpoch(NamedTuple):
-    """What an epoch returns.
+    """Result of an epoch.
 
     Attributes:
         params: Parameters after the last batch.

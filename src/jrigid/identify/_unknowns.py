@@ -39,7 +39,7 @@ _ZERO = -25.0
 # This is not a pytree, so that `tree_map` takes it for a leaf in `prior` and `each`.
 @dataclasses.dataclass(frozen=True)
 class _Pick:
-    """What `free` is given in the place of an array: its index and how it is sought.
+    """Mark that `free` gets in place of an array: its index and how it is sought.
 
     Attributes:
         index: Index among the arrays of the system and the sensors.
@@ -127,7 +127,7 @@ class AbstractSought(Readable):
 
     @property
     def size(self) -> int:
-        """How many numbers there are."""
+        """Count of its numbers."""
         return self.base.size
 
     @property
@@ -341,7 +341,7 @@ def _name(parts: Sequence[RigidBody | AbstractSensor], path: Sequence[Any]) -> s
 
 
 def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
-    """What `free` picks among the arrays, in their order."""
+    """Arrays that `free` picks, in their order."""
     if free is None:
         return []
     indices = range(len(arrays.paths))
@@ -373,7 +373,7 @@ def _picks(arrays: _Arrays, free: Callable[..., Any] | None) -> list[_Pick]:
 
 
 class Unknowns(eqx.Module):
-    """What is sought, in what numbers, around what system and sensors.
+    """Numbers that a fit seeks, and the system and sensors that they belong to.
 
     Attributes:
         given: Arrays of the system and the sensors, some with an axis of trials in
@@ -540,7 +540,7 @@ class Unknowns(eqx.Module):
 
     @property
     def _arrays(self) -> int:
-        """How many arrays the system and the sensors have."""
+        """Number of arrays of the system and the sensors."""
         return len(self.stacked) - len(self.groups)
 
     def _built(self, leaves: Sequence[AnyArray]) -> tuple[Any, ...]:

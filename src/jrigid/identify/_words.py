@@ -12,23 +12,21 @@ from jrigid._core.third_party import names_of
 from jrigid._types import AnyArray
 from jrigid.identify._errors import weakest_of
 from jrigid.identify._inertia_models import Fixed, Flat, Symmetric, Tensor, Top
-from jrigid.identify._reasons import reason
+from jrigid.identify._reasons import CORRELATED, SURELY_CORRELATED, reason
 from jrigid.identify._result import LARGEST_ERROR, FitResult, Status
 
-_LIKE = 0.1  # correlation of neighbours that is no noise
-_SURE = 5.0  # standard deviations of that
 # Relative change of a tensor by a unit of one of its numbers: of a thickness.
-_FAINT = 0.02
+_NO_CHANGE = 0.02
 
 
 def _of_shape(result: FitResult, direction: np.ndarray) -> str:
-    """What a change of the inertia model does to the body."""
+    """Name the effect on the body of a change of the inertia model."""
     tensor_of = result.unknowns.inertia
     slope = jax.jvp(tensor_of, (result.numbers,), (jnp.asarray(direction),))[1]
     axes = np.asarray(result.axes)
     moments = np.asarray(result.moments)
     inside = axes.T @ np.asarray(slope) @ axes
-    if np.abs(inside).max() < _FAINT * moments.max():
+    if np.abs(inside).max() < _NO_CHANGE * moments.max():
         return "thickness"
     relative = np.diag(inside) / moments
     # A common factor of all moments does not change their ratios.
@@ -45,7 +43,7 @@ def _of_shape(result: FitResult, direction: np.ndarray) -> str:
 
 
 def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
-    """What a change of the inertia model, the scale's or an array's numbers is."""
+    """Name a change of the numbers of the inertia model, the scale or an array."""
     unknowns = result.unknowns
     part = unknowns.slices[name]
     sizes = np.abs(direction[part])
@@ -64,7 +62,7 @@ def _of_part(result: FitResult, name: str, direction: np.ndarray) -> str:
     return f"{owner} {field}"
 
 
-def _untold(result: FitResult, direction: np.ndarray) -> str:
+def _undetermined(result: FitResult, direction: np.ndarray) -> str:
     """A direction of the numbers, in words, the largest part first."""
     parts = result.unknowns.slices.items()
     sizes = {name: float(np.sqrt(np.sum(direction[s] ** 2))) for name, s in parts}
@@ -76,7 +74,7 @@ def _untold(result: FitResult, direction: np.ndarray) -> str:
 
 
 def null_directions(result: FitResult) -> tuple[str, ...]:
-    """What the record does not determine."""
+    """Quantities that the record does not determine, in words."""
     texts = [
         *_undetermined_scale(result),
         *_undetermined_numbers(result),
@@ -105,7 +103,7 @@ def _undetermined_numbers(result: FitResult) -> list[str]:
     directions = np.asarray(diagnostics.directions).T
     values = np.asarray(diagnostics.singular_values)
     weak = math.sqrt(diagnostics.inflation) > LARGEST_ERROR * values
-    texts += [_untold(result, x) for x in directions[weak]]
+    texts += [_undetermined(result, x) for x in directions[weak]]
     if diagnostics.pure_spin:
         return texts
     loose = bool(np.any(result.ratios_errors > LARGEST_ERROR * result.ratios))
@@ -115,7 +113,7 @@ def _undetermined_numbers(result: FitResult) -> list[str]:
         units = np.asarray(unknowns.natural_units(result.numbers))
         covariance = np.asarray(result.numbers_covariance)
         _, normal, _ = weakest_of(unknowns.judged, covariance, units)
-        weakest = _untold(result, normal * units)
+        weakest = _undetermined(result, normal * units)
         texts.append(f"{weakest}: others far from it are nearly as good")
     return texts
 
@@ -136,10 +134,10 @@ def _diagonal(matrix: Any) -> np.ndarray:
 
 
 def _spread_of_trials(result: FitResult) -> float:
-    """How many times larger chi-square is in some trials than in others.
+    """Ratio of the largest to the least chi-square of a trial, without extreme tenths.
 
-    Of three trials and more, without the extreme tenths; 1 of fewer. Trials that were
-    left out have no residuals.
+    The ratio is 1 if there are fewer than three trials. Trials that were left out have
+    no residuals.
     """
     by_trial = np.asarray(result.diagnostics.chi_square_by_trial, np.float64)
     by_trial = by_trial[~np.asarray(result.rejected_trials)]
@@ -162,7 +160,7 @@ def _of_record(result: FitResult) -> list[tuple[Any, str]]:
             f"residuals are {size:.2g} times the stated noise",
         ),
         (
-            abs(like) > _LIKE and sure > _SURE,
+            abs(like) > CORRELATED and sure > SURELY_CORRELATED,
             "residuals are not white: neighbours correlate by "
             f"{like:.2f}, {sure:.0f} standard deviations from none",
         ),
@@ -205,7 +203,7 @@ def _of_saturation(result: FitResult) -> list[tuple[Any, str]]:
 
 
 def remarks(result: FitResult) -> tuple[str, ...]:
-    """What to bear in mind."""
+    """Remarks that a reader of the result should bear in mind."""
     notes = _of_record(result)
     # These models assume equal moments, or know them, and a pure spin tells no ratio.
     assumes = isinstance(result.unknowns.inertia_model, Symmetric | Top | Fixed)
@@ -328,7 +326,7 @@ def _of_torque(result: FitResult) -> list[str]:
         f"  unmodelled torque {levels} N m s^1/2, {memory}; the sensors alone would "
         f"make {part:.0f} % of the errors"
     ]
-    by_trial = np.asarray(result.level_by_trial)
+    by_trial = np.asarray(result.level_by_trial)[~np.asarray(result.rejected_trials)]
     if np.any(by_trial != by_trial[0]):
         limits = f"{by_trial.min():.2g} to {by_trial.max():.2g}"
         lines.append(f"  its level in trials: {limits} times that")
@@ -359,7 +357,7 @@ def report(result: FitResult) -> str:
 
 
 def _of_many(codes: np.ndarray) -> str:
-    """How many fits ended in which way."""
+    """Counts of fits by their status, in words."""
     names = dict(enumerate(names_of(Status)))
     counts = {names[code]: np.sum(codes == code) for code in sorted(names)}
     text = ", ".join(f"{count} {name}" for name, count in counts.items() if count)

@@ -75,7 +75,7 @@ _Unphysical = Literal["raise", "nearest", "keep"]
 
 
 class _Stated(NamedTuple):
-    """What a file states of an inertial.
+    """Attributes that a file states of an inertial.
 
     Attributes:
         attributes: As MJCF's attributes, whatever the format.

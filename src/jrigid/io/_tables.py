@@ -79,7 +79,7 @@ def _of_trajectory(motion: Trajectory) -> Dataset:
 
 
 class _Estimate(NamedTuple):
-    """What a fit found, with standard errors of the same shape."""
+    """Estimate of a fit, with standard errors of the same shape."""
 
     dimensions: tuple[str, ...]
     values: Any

@@ -28,7 +28,7 @@ class Document(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What an error calls it."""
+        """Name in error messages."""
         return "The text" if self.path is None else f"File {str(self.path)!r}"
 
 

@@ -71,7 +71,7 @@ def _why_open(faces: Int[np.ndarray, "faces 3"], vertices: int) -> str:
 
 
 def is_closed_traced(faces: Int[Array, "faces 3"], vertices: int) -> Bool[Array, ""]:
-    """As `is_closed`, at run time."""
+    """Whether faces run through each edge once forth and once back, at run time."""
     # Three edges a face and two faces an edge make the number of faces even.
     if faces.shape[0] % 2:
         return jnp.asarray(False)

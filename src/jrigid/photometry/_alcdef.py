@@ -148,7 +148,7 @@ class _Parser:
         session.errors.append(float(error))
 
     def _delimiter(self, session: _Session) -> str:
-        """What stands between the values of a point."""
+        """Text between the values of a point."""
         if "DELIMITER" not in session.metadata:
             raise self.error(
                 "the metadata have no DELIMITER: add DELIMITER=PIPE or DELIMITER=TAB.",
@@ -203,12 +203,14 @@ def read_alcdef(
             missing between the times before it and those after it.
 
     Returns:
-        A light curve for each session, all with the same epoch. Their `band` is MAGBAND,
-        or else FILTER. Their `errors` are those of the points, if each point has one.
+        A light curve for each session, all with the same epoch. Their `band` is
+        MAGBAND, or else FILTER. Their `errors` are those of the points, if each point
+        has one.
 
     Raises:
-        ValueError: A line that does not hold what it should, with the file and the line;
-            several objects; positions that are not vectors; or another `time_scale`.
+        ValueError: A line that does not hold what it should, with the file and the
+            line; several objects; positions that are not vectors; or another
+            `time_scale`.
         ImportError: Another scale than "tdb" without the extra `jrigid[photometry]`.
 
     Source: ALCDEF, Definition and standards, v. 2.2.7 (alcdef.org).
@@ -249,8 +251,8 @@ def read_alcdef(
 def _check_one_object(parser: _Parser) -> None:
     """Raise ValueError for sessions of several objects.
 
-    Objects without a number have 0, and are identified by their designations. A numbered
-    object may have several of these.
+    Objects without a number have 0, and are identified by their designations. A
+    numbered object may have several of these.
     """
     first: dict[str, str] = {}
     for session in parser.sessions:
@@ -312,7 +314,7 @@ def _curve(
 def _vectors(
     positions: Positions, dates: Float[np.ndarray, " epochs"]
 ) -> tuple[Vectors, Vectors]:
-    """What the caller's function returns, checked."""
+    """Vectors that the caller's function returns, checked."""
     vectors = [np.asarray(each, dtype=float) for each in positions(dates)]
     shape = (len(dates), 3)
     if [each.shape for each in vectors] != [shape, shape]:

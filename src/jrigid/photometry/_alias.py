@@ -44,7 +44,7 @@ _LARGEST_OF_RATIO = 0.5
 
 
 class Estimates(NamedTuple):
-    """What observers quote of a tumbler, or the standard errors of these.
+    """Quantities that observers quote of a tumbler, or their standard errors.
 
     Attributes:
         precession_period: P_phi, or the period of a principal-axis rotation [s].
@@ -201,7 +201,7 @@ def _estimates_and_slopes(
 
 
 def estimates_at(vector: Array, task: Task, span: Array) -> Estimates:
-    """What observers quote."""
+    """Quantities that observers quote, from the vector of numbers."""
     numbers = unpacked(vector)
     tumbles = task.mode != Mode.principal_axis
     pole = product("ij,i->j", task.frame, axes_of_momentum(numbers.pole)[2])

@@ -49,7 +49,7 @@ _OF_SURFACE = 7
 
 
 class ConvexNumbers(NamedTuple):
-    """What a fit seeks; leaves may have lanes in front.
+    """Numbers that a fit seeks; leaves may have lanes in front.
 
     Attributes:
         motion: Numbers of the motion, at least.
@@ -94,7 +94,7 @@ class Surface(NamedTuple):
 
     @property
     def motion(self) -> int:
-        """How many numbers describe the motion."""
+        """Count of the numbers that describe the motion."""
         return self.sought.shape[-1] - _OF_SURFACE - self.harmonics.shape[-1]
 
 
@@ -266,7 +266,7 @@ def openness(shape: Float[Array, " harmonics"], surface: Surface) -> Float[Array
 
 
 class Placed(NamedTuple):
-    """What numbers of the motion lead to.
+    """Directions and gaps that follow from the numbers of the motion.
 
     Attributes:
         directions: To the Sun and to the observer at each epoch, body axes.
@@ -282,7 +282,7 @@ Motion = Callable[[Array], Placed]
 
 
 def _steady(motion: Float[Array, "3"], frame: Matrix, readings: Readings) -> Placed:
-    """What a steady rotation about the z axis of the body shows.
+    """Directions under a steady rotation about the z axis of the body.
 
     At time 0 the x axis of the body points south of the pole, in the axes of the fit.
     """

@@ -1,4 +1,4 @@
-"""Light curves as a fit takes them: one whitened vector, and what the model cannot say."""
+"""Light curves for a fit: one whitened vector, and columns for unknown factors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -60,7 +60,7 @@ class Readings(NamedTuple):
         return whitened - self.factors(whitened)
 
     def factor_count(self) -> int:
-        """How many unknown factors there are."""
+        """Number of unknown factors."""
         # Columns of zeros fill the array up to a few sizes.
         return int(np.count_nonzero(np.any(self.basis != 0, axis=0)))
 
@@ -162,21 +162,21 @@ def _check_curves(curves: Sequence[LightCurve]) -> None:
             count > 0
             and np.shape(curve.brightness) == (count,)
             and all(x.shape == (count, 3) for x in vectors),
-            f"Curve {index} of `curves` must have a point or more, and a brightness and "
-            "two vectors for each point, but it has not.",
+            f"Curve {index} of `curves` must have a point or more, and a brightness "
+            "and two vectors for each point, but it has not.",
         )
         lengths = np.linalg.norm(vectors, axis=-1)
         demand(
             bool(np.all(np.isfinite(curve.ts)))
             and bool(np.all(np.isfinite(lengths) & (lengths > 0))),
-            f"Curve {index} of `curves` must have finite times and vectors other than 0, "
-            "but it has not.",
+            f"Curve {index} of `curves` must have finite times and vectors other than "
+            "0, but it has not.",
         )
         sums = _unit(vectors[0]) + _unit(vectors[1])
         demand(
             bool(np.all(np.linalg.norm(sums, axis=1) > _LEAST_LIT)),
-            f"Curve {index} of `curves` must show a body that is lit, but at a point the "
-            "Sun is straight behind it: are both vectors from the body?",
+            f"Curve {index} of `curves` must show a body that is lit, but at a point "
+            "the Sun is straight behind it: are both vectors from the body?",
         )
     # A body of some metres has brightness of this size, too, but hardly in every curve.
     demand(
@@ -244,8 +244,8 @@ def follows(
     chance = _SURE * np.sqrt(2 / freedom)
     if stated and reduced > 1 - chance:
         return correlation, bool(reduced < 1 + chance)
-    # A noise that was found makes chi-square over its degrees of freedom 1, and one that
-    # was stated too large may hide a misfit, which neighbouring points share.
+    # A noise that was found makes chi-square over its degrees of freedom 1, and one
+    # that was stated too large may hide a misfit, which neighbouring points share.
     return correlation, deviations <= _SURE
 
 

@@ -143,8 +143,8 @@ def read_light_curves(
         )
         if points < 1 or absolute not in (0, 1):
             raise lines.error(
-                "a light curve must have at least 1 point and the kind 0 (relative) or 1 "
-                f"(absolute), but it has {points} and {absolute}."
+                "a light curve must have at least 1 point and the kind 0 (relative) or "
+                f"1 (absolute), but it has {points} and {absolute}."
             )
         rows: list[list[Decimal]] = []
         for _ in range(points):
@@ -160,8 +160,8 @@ def read_light_curves(
         if curve.has_magnitudes:
             raise lines.error(
                 f"the brightness of light curve {index + 1} looks like magnitudes m: "
-                "take 10^(-0.4 m). Fluxes may be divided by any number, the same for all "
-                "curves of kind 1."
+                "take 10^(-0.4 m). Fluxes may be divided by any number, the same for "
+                "all curves of kind 1."
             )
         curves.append(curve)
     if lines:

@@ -116,8 +116,8 @@ def lommel_seeliger_brightness(
 
     A point of the ellipsoid is A n, with n on the unit sphere and A the diagonal matrix
     of the semi-axes; an element of the surface with its normal is |A| A^-1 n dn. With
-    unit vectors u0 and u along A^-1 e0 and A^-1 e, of lengths s0 and s, the integrand is
-    |A| s0 s (u0 n) (u n) / (s0 u0 n + s u n): a lune of the sphere between two great
+    unit vectors u0 and u along A^-1 e0 and A^-1 e, of lengths s0 and s, the integrand
+    is |A| s0 s (u0 n) (u n) / (s0 u0 n + s u n): a lune of the sphere between two great
     circles, over which the integral is elementary. With the ratio
     r = |s0 u0 + s u| / (s0 + s) it is
     pi / 4 |A| s0 s / (s0 + s) |u0 + u|^2 (r - (1 - r^2) artanh r) / r^3.

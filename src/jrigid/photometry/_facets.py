@@ -122,8 +122,8 @@ def facets_from_mesh(
 
     Raises:
         ValueError: A mesh that is not convex (where `vertices` is known at trace time):
-            its parts would cast shadows on each other. With `hull=True`, `vertices` that
-            `jit` or `vmap` traces.
+            its parts would cast shadows on each other. With `hull=True`, `vertices`
+            that `jit` or `vmap` traces.
 
     Gradients: exact in the vertices; those of a hull are of the triangles at hand, and
     those in vertices inside of it are 0.
@@ -145,8 +145,8 @@ def facets_from_mesh(
     )
     demand(
         bool(faces.size and faces.min() >= 0 and faces.max() < len(vertices)),
-        f"Argument `faces` must hold indices from 0 to {len(vertices) - 1}, but it does "
-        "not.",
+        f"Argument `faces` must hold indices from 0 to {len(vertices) - 1}, but it "
+        "does not.",
     )
     demand(
         albedo is None or not hull,

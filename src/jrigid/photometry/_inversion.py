@@ -1,4 +1,4 @@
-"""Inversion of light curves: every tumbler that explains them, with errors and weights."""
+"""Inversion of light curves: tumblers that explain them, with errors and weights."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -41,14 +41,15 @@ _HOUR = 3600.0
 # Of the ratio of two axes: the light of such a body hardly changes as it rotates.
 _NEARLY_ROUND = 0.02
 _ROUND = (
-    "   nearly round about this axis, so that the light hardly shows the rotation: P_psi "
-    "and E/E0 follow from the moments of the ellipsoid, and other values may be as good"
+    "   nearly round about this axis, so that the light hardly shows the rotation: "
+    "P_psi and E/E0 follow from the moments of the ellipsoid, and other values may be "
+    "as good"
 )
 # A ratio of two axes below which no known asteroid is.
 _THIN = 0.1
 _IS_THIN = (
-    "   an ellipsoid as thin as no known body: the curves are few for its shape, and the "
-    "errors mean little"
+    "   an ellipsoid as thin as no known body: the curves are few for its shape, and "
+    "the errors mean little"
 )
 # How many of the solutions that do not count as aliases are kept.
 _REJECTED = 5
@@ -73,8 +74,8 @@ class Inversion:
         correlation: Of the best alias's residuals at neighbouring points of a curve. It
             is near 0 for noise, and near 1 for a light curve that is missed.
         follows: Whether the best alias follows the curves to their noise, as far as it
-            is known. If it is not stated, or stated too large, its residuals need only be
-            uncorrelated, which says little of curves whose points are far apart in
+            is known. If it is not stated, or stated too large, its residuals need only
+            be uncorrelated, which says little of curves whose points are far apart in
             time.
         determined: Whether the curves determine the motion: the best alias follows
             them, and all others have its periods and its mode. Their momenta may point
@@ -110,7 +111,7 @@ class Inversion:
     def separation(
         self, curves: Sequence[LightCurve], noise: float
     ) -> Float[np.ndarray, "curves aliases aliases"]:
-        """How well each of several future light curves would tell aliases apart.
+        """Power of each of several future light curves to tell aliases apart.
 
         Args:
             curves: Light curves with the epochs and the geometry that are planned;
@@ -146,7 +147,7 @@ class Inversion:
         return chosen_nights(predicted, self.aliases, curves, threshold)
 
     def _predictions(self, curves: Sequence[LightCurve], noise: float) -> Predictions:
-        """What the aliases predict."""
+        """Predictions of the aliases."""
         return predictions(self.aliases, curves, noise, self.epoch, self.span)
 
 
@@ -198,7 +199,8 @@ def find_tumblers(
     >>> shape = jr.photometry.Ellipsoid(jnp.array([1.0, 0.6, 0.5]))
     >>> hour = 3600.0
     >>> body = jr.photometry.Tumbler(
-    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape, mode="principal-axis")
+    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape,
+    ...     mode="principal-axis")
     >>> ts = np.linspace(0.0, 40 * hour, 100)
     >>> angle = ts / 4e5
     >>> sun = np.stack([np.cos(angle), np.sin(angle), 0.2 + 0 * ts], axis=1)
@@ -360,7 +362,7 @@ def report_of(inversion: Inversion) -> str:
 
 
 def _verdict(inversion: Inversion) -> str:
-    """What the table says, in a sentence."""
+    """A sentence that sums up the table."""
     count = len(inversion.aliases)
     points = f"chi-square over {inversion.degrees_of_freedom} degrees of freedom"
     value = (
@@ -378,9 +380,9 @@ def _verdict(inversion: Inversion) -> str:
         return f"One tumbler explains the light curves: {value}."
     if inversion.determined:
         return (
-            f"{count} tumblers explain the light curves. They have the same periods and "
-            "mode, and differ in the direction of the angular momentum or in the shape: "
-            f"{value}."
+            f"{count} tumblers explain the light curves. They have the same periods "
+            "and mode, and differ in the direction of the angular momentum or in the "
+            f"shape: {value}."
         )
     return (
         f"{count} tumblers explain the light curves, which do not say which one is "
@@ -401,8 +403,9 @@ def _described(rank: int, alias: Alias) -> list[str]:
     else:
         periods += f", P_psi {in_hours(x.rotation_period, error.rotation_period)}"
     pole = (
-        f"   angular momentum towards longitude {in_degrees(x.longitude, error.longitude)}, "
-        f"latitude {in_degrees(x.latitude, error.latitude)}"
+        "   angular momentum towards longitude "
+        f"{in_degrees(x.longitude, error.longitude)}, latitude "
+        f"{in_degrees(x.latitude, error.latitude)}"
     )
     shape = ", ".join(
         f"{name} {value:.3f} +- {spread:.3f}"

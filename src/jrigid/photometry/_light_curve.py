@@ -70,7 +70,7 @@ def _brightness(
 
 
 def phase_angle(to_sun: Vector, to_observer: Vector) -> Scalar:
-    """Angle between Sun and observer, seen from the body [rad]; its gradient at 0 is 0."""
+    """Angle between Sun and observer from the body [rad]; its gradient at 0 is 0."""
     # The arc cosine of a product would lose digits near 0, with an infinite slope.
     across = safe_norm(jnp.cross(to_sun, to_observer))
     return safe_arctan2(across, product("i,i->", to_sun, to_observer))
@@ -98,8 +98,8 @@ def light_curve(
         inertia: Principal moments, or a symmetric tensor in body axes [kg m^2]; or a
             `RigidBody`, whose torque needs no `args`.
         state0: State at `t0`.
-        ts: Epochs [s], in any order. The light of a `RigidBody` must leave it at `t0` or
-            later.
+        ts: Epochs [s], in any order. The light of a `RigidBody` must leave it at `t0`
+            or later.
         to_sun: Vectors from the body to the Sun at the epochs, space axes [m].
         to_observer: Vectors from the body to the observer, space axes [m].
         shape: `Facets` or an `Ellipsoid`, in body axes.
@@ -134,8 +134,8 @@ def light_curve(
     )
     demand(
         len(ts) == len(to_sun) == len(to_observer),
-        "Arguments `ts`, `to_sun` and `to_observer` must have one entry for each epoch, "
-        f"but they have {len(ts)}, {len(to_sun)} and {len(to_observer)}.",
+        "Arguments `ts`, `to_sun` and `to_observer` must have one entry for each "
+        f"epoch, but they have {len(ts)}, {len(to_sun)} and {len(to_observer)}.",
     )
     if light_time:
         ts = ts - safe_norm(to_observer) / SPEED_OF_LIGHT

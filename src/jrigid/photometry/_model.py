@@ -26,7 +26,7 @@ class Mode(enum.IntEnum):
 
 
 class Numbers(NamedTuple):
-    """What a fit seeks; leaves may have lanes in front.
+    """Numbers that a fit seeks; leaves may have lanes in front.
 
     Attributes:
         cycles: Turns of precession and of rotation within the span.
@@ -61,7 +61,7 @@ def unpacked(vector: Float[AnyArray, "*lanes 11"]) -> Numbers:
 
 
 class Task(NamedTuple):
-    """How the numbers of one lane are read.
+    """Interpretation of the numbers of one lane.
 
     Attributes:
         frame: Axes of the fit, in which the pole is near the x axis; rows are their
@@ -80,7 +80,7 @@ class Task(NamedTuple):
 
 
 def sought(task: Task) -> Bool[Array, " 11"]:
-    """Which numbers a lane seeks; the others have no meaning there."""
+    """Whether a lane seeks each number; the others have no meaning there."""
     tumbles = task.mode != Mode.principal_axis
     always = jnp.ones(2, bool)
     free = tumbles & ~task.homogeneous
@@ -98,7 +98,7 @@ def sought(task: Task) -> Bool[Array, " 11"]:
 
 
 def independent(task: Task) -> Bool[Array, " 11"]:
-    """Which of the numbers that a lane seeks do not follow from the others.
+    """Whether a lane seeks each number and it does not follow from the others.
 
     The two frequencies of a tumbler determine its tilt.
     """
@@ -156,7 +156,7 @@ def gap_of_periods(numbers: Numbers, motion: Wobble, task: Task) -> Scalar:
 
 
 class Geometry(NamedTuple):
-    """What the brightness at all epochs depends on, computed once from the numbers.
+    """Parts of the model that serve all epochs, computed once from the numbers.
 
     Attributes:
         cycles: Turns of precession and of rotation within the span.
@@ -196,7 +196,7 @@ def axes_of_momentum(pole: Float[Array, "2"]) -> Matrix:
 
 
 def directions_of_axes(geometry: Geometry, mode: Array, time: Scalar) -> Matrix:
-    """Directions of the body axes at a time in spans, in axes with z along the momentum.
+    """Directions of body axes at a time in spans, in axes with z along the momentum.
 
     Row i is the direction of axis i.
     """

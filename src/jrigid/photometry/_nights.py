@@ -24,7 +24,8 @@ class NightPlan:
         chosen: Indices of the curves, the most useful one first.
         growth: For each pair of aliases, the growth of chi-square by all of these
             curves that the wrong one of the pair has at least.
-        decided: Pairs of aliases (ranks from 1) that each chosen curve tells apart first.
+        decided: Pairs of aliases (ranks from 1) that each chosen curve tells apart
+            first.
         threshold: Growth above which a pair is apart.
         dates: Julian dates of the first and last point of each chosen curve.
 
@@ -47,7 +48,7 @@ class NightPlan:
 
 
 class Predictions(NamedTuple):
-    """What aliases predict for planned light curves, over the noise.
+    """Predictions of aliases for planned light curves, over the noise.
 
     Attributes:
         rows: Of each alias, but for the sign.
@@ -69,7 +70,7 @@ def predictions(
     epoch: float,
     span: float,
 ) -> Predictions:
-    """What aliases predict for planned light curves.
+    """Predictions of aliases for planned light curves.
 
     Args:
         aliases: The aliases.
@@ -185,7 +186,7 @@ def _report(plan: NightPlan) -> str:
     elif count < 2:
         lines.append("There is one alias, so that nothing must be told apart.")
     lines.append(
-        "In brackets: by how much the chi-square of the wrong one grows at least, by all "
-        f"of these curves; {plan.threshold:g} decides."
+        "In brackets: by how much the chi-square of the wrong one grows at least, by "
+        f"all of these curves; {plan.threshold:g} decides."
     )
     return "\n".join(lines)

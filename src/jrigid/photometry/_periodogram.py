@@ -29,8 +29,8 @@ _OVERSAMPLING_OF_LINES = 8
 _LINES = 10
 # A search takes minutes for 10,000 cycles. More than this are hours for seconds.
 _MOST_CYCLES = 100_000
-# Lines k f_phi + m f_psi that are the strongest ones of tumblers. An ellipsoid looks the
-# same after half a turn about each of its axes, so m is even.
+# Lines k f_phi + m f_psi that are the strongest ones of tumblers. An ellipsoid looks
+# the same after half a turn about each of its axes, so m is even.
 _STRONGEST = ((2, 0), (2, -2), (2, 2), (1, -2), (1, 2), (1, 0))
 # Lines of the series that is fitted for a pair.
 _SERIES = ((0, 2), (1, -2), (1, 0), (1, 2), (2, -2), (2, 0), (2, 2))
@@ -104,7 +104,8 @@ def period_pairs(
     >>> import jax.numpy as jnp, jrigid as jr
     >>> ts = jnp.linspace(0.0, 1e6, 300)
     >>> # a line at 2 (f_phi - f_psi) and one at 2 f_phi
-    >>> wave = 0.1 * jnp.cos(4 * jnp.pi * ts / 3e4) + 0.03 * jnp.cos(4 * jnp.pi * ts / 2e4)
+    >>> wave = 0.1 * jnp.cos(4 * jnp.pi * ts / 3e4)
+    >>> wave = wave + 0.03 * jnp.cos(4 * jnp.pi * ts / 2e4)
     >>> far = jnp.ones((300, 3))
     >>> curve = jr.photometry.LightCurve(0.0, ts, 10**(-0.4 * wave), far, far, True)
     >>> pairs = jr.photometry.period_pairs([curve], 1e4, 1e5, count=5)
@@ -123,7 +124,7 @@ def period_pairs(
 
 
 def points_of(curves: Sequence[LightCurve]) -> int:
-    """How many points curves have.
+    """Number of points of light curves.
 
     Raises:
         ValueError: They are fewer than the numbers of a tumbler.
@@ -142,8 +143,8 @@ def cycles_within(span: float, shortest: float, longest: float) -> tuple[float, 
     """Lowest and highest frequency of periods, in cycles within the span."""
     demand(
         bool(0 < shortest < longest),
-        "Arguments `shortest` and `longest` must be positive periods in this order, but "
-        f"they are {shortest:g} s and {longest:g} s.",
+        "Arguments `shortest` and `longest` must be positive periods in this order, "
+        f"but they are {shortest:g} s and {longest:g} s.",
     )
     check_span(span, shortest)
     demand(
@@ -229,7 +230,7 @@ def shared_places(
     count: int,
     most: int,
 ) -> list[int]:
-    """As `unlike`, with at most so many of one group while there are other groups.
+    """Choose as `unlike` does, but at most so many of a group while others remain.
 
     Args:
         places: Where each index is.
@@ -283,7 +284,7 @@ def modulations(readings: Readings) -> Float[np.ndarray, "epochs 3"]:
 def _explained(
     series: tuple[tuple[int, ...], ...], readings: Readings, frequencies: np.ndarray
 ) -> Float[np.ndarray, " many"]:
-    """What a series explains for each row of frequencies."""
+    """Part of chi-square that a series explains for each row of frequencies."""
     modulating = modulations(readings)
     return in_batches(
         _BLOCK, lambda x: _powers(series, readings, modulating, x), frequencies
@@ -297,7 +298,7 @@ def _powers(
     modulating: Float[Array, "epochs 3"],
     frequencies: Float[Array, "many n"],
 ) -> Float[Array, " many"]:
-    """What a series explains for each row of frequencies, some at a time."""
+    """Part of chi-square that a series explains for each row, some at a time."""
     one = functools.partial(_power, series, readings, modulating)
     return jax.lax.map(one, frequencies, batch_size=_LANES)
 

@@ -67,9 +67,9 @@ def mesh_from_facets(
     """The mesh of the convex body that has given facets.
 
     Light depends on the areas and the normals of facets alone, so that `find_spin` and
-    `fit_shape` return no corners. These follow from the areas and normals by Minkowski's
-    theorem: only one convex body has them. `from_mesh` gives its inertia if it is
-    homogeneous, and programs for meshes draw and print it.
+    `fit_shape` return no corners. These follow from the areas and normals by
+    Minkowski's theorem: only one convex body has them. `from_mesh` gives its inertia if
+    it is homogeneous, and programs for meshes draw and print it.
 
     Args:
         facets: Areas and normals. Their albedos are not used.
@@ -191,7 +191,7 @@ def _nearer(
     normals: Float[np.ndarray, "planes 3"],
     least: float,
 ) -> _Body:
-    """The body after a step of Newton's method, which is halved until areas agree better.
+    """The body after a step of Newton's method, halved until areas agree better.
 
     Args:
         body: The body before.

@@ -87,7 +87,7 @@ _SOUGHT = np.concatenate(
 
 
 class ShapeEstimates(NamedTuple):
-    """What observers quote of a tumbler and its surface, or the standard errors.
+    """Quantities that observers quote of a tumbler and its surface, or their errors.
 
     Attributes:
         precession_period: P_phi [s].
@@ -125,8 +125,8 @@ class ShapeFit:
         epoch: Julian date of time 0 of the tumbler.
         noise: Standard deviation of a point [mag], stated or found; the median if they
             differ.
-        chi_square: Sum of squares of the residuals over the noise, and of what the areas
-            and the numbers deviate from what is expected, over its spread.
+        chi_square: Sum of squares of the residuals over the noise, and of what the
+            areas and the numbers deviate from what is expected, over its spread.
         reduced_chi_square: Chi-square of the light over its degrees of freedom.
         degrees_of_freedom: Points less unknown numbers.
         correlation: Of the residuals at neighbouring points of a curve. It is near 0
@@ -188,7 +188,8 @@ def fit_shape(
         curves: Light curves, corrected for the light time.
         tumbler: Where the fit starts. It is a short-axis or long-axis mode, and its
             periods count the turns within the curves rightly. Its moments must be near:
-            far ones may end in another minimum. The shape starts as its ellipsoid; facets are replaced by an ellipsoid with the tumbler's moments.
+            far ones may end in another minimum. The shape starts as its ellipsoid;
+            facets are replaced by an ellipsoid with the tumbler's moments.
         noise: Standard deviation of a point [mag]. None: the `errors` of the curves if
             all have them. Else it is what the fit leaves, and a misfit cannot be seen.
         epoch: Julian date of time 0 of the tumbler, as `Inversion.epoch`.
@@ -264,7 +265,7 @@ def fit_shape(
 
 
 def _task(tumbler: Tumbler) -> Task:
-    """How the numbers of the motion are read: the momentum is near the x axis."""
+    """Interpretation of the motion's numbers: the momentum is near the x axis."""
     pole = direction_of_pole(
         np.asarray(tumbler.longitude), np.asarray(tumbler.latitude)
     )
@@ -295,8 +296,8 @@ def _start(
     tilt = tumbling(moments, tumbler.state.omega).tilt_max
     demand(
         bool(np.isfinite(tilt)),
-        "Argument `tumbler` must have periods of a motion of its mode with its moments, "
-        "but there is none: see `omega_from_periods`.",
+        "Argument `tumbler` must have periods of a motion of its mode with its "
+        "moments, but there is none: see `omega_from_periods`.",
     )
     motion = Numbers(
         cycles=span / periods,
@@ -316,7 +317,7 @@ def _start(
 
 
 def _moved(motion: Float[Array, "11"], task: Task, readings: Readings) -> Placed:
-    """What a tumbler shows."""
+    """Directions from a tumbler to Sun and observer, and the gap of its periods."""
     numbers = unpacked(motion)
     geometry = geometry_of(numbers, task)
     of_time = functools.partial(directions_of_axes, geometry, task.mode)
@@ -379,7 +380,7 @@ def _fit(
     curves: Sequence[LightCurve],
     stated: bool,
 ) -> ShapeFit:
-    """What was found."""
+    """Result of the fit: the tumbler, its estimates, errors and statistics."""
     free = freedom(readings, surface)
     residuals = np.asarray(_residuals(vector, task, surface, readings))
     reduced = float(np.sum(np.square(residuals))) / free

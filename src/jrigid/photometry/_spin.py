@@ -80,7 +80,7 @@ _NEEDS_SCALE = ("amplitude", "width", "slope")
 
 
 class SpinEstimates(NamedTuple):
-    """What observers quote of a steady rotation, or the standard errors of these.
+    """Quantities that observers quote of a steady rotation, or their errors.
 
     Attributes:
         period: Sidereal period of rotation [s].
@@ -112,8 +112,8 @@ class Spin:
             was found within a quarter of a radian. They know nothing of other poles.
             They hold if the errors of the points are independent and the surface is as
             assumed, and are enlarged where chi-square is too large.
-        chi_square: Sum of squares of the residuals over the noise, and of what the areas
-            and the numbers deviate from what is expected, over its spread.
+        chi_square: Sum of squares of the residuals over the noise, and of what the
+            areas and the numbers deviate from what is expected, over its spread.
         open_share: Length of the sum of the areas as vectors, over their sum: 0 for a
             closed surface. Above about .01 the albedo is not uniform, or the body is
             far from convex.
@@ -229,7 +229,8 @@ def find_spin(
     >>> shape = jr.photometry.Ellipsoid(jnp.array([1.5, 1.0, 0.8]))
     >>> hour = 3600.0
     >>> body = jr.photometry.Tumbler(
-    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape, mode="principal-axis")
+    ...     shape.moments, 6 * hour, 1.0, 1.0, 0.5, 0.0, 0.0, shape,
+    ...     mode="principal-axis")
     >>> ts = np.linspace(0.0, 400 * hour, 120)
     >>> angle = ts / 4e5
     >>> seen = angle + 0.4 * np.cos(angle)
@@ -239,7 +240,8 @@ def find_spin(
     >>> light = np.asarray(body.light_curve(ts, sun, earth)) * 10 ** (-0.4 * noise)
     >>> curve = jr.photometry.LightCurve(0.0, ts, light, sun, earth, is_relative=True)
     >>> found = jr.photometry.find_spin(
-    ...     [curve], 0.01, shortest=5.9 * hour, longest=6.1 * hour, degree=3, facets=128)
+    ...     [curve], 0.01, shortest=5.9 * hour, longest=6.1 * hour, degree=3,
+    ...     facets=128)
     >>> best = found.solutions[0]  # a Spin with its body and its SpinEstimates
     >>> print((best.estimates.period / hour).round(2))
     6.0
@@ -287,8 +289,8 @@ def check_curves(
     )
     demand(
         noise is None or (np.ndim(noise) == 0 and noise > 0),
-        f"Argument `noise` must be a positive number or None, but it is {noise}: errors "
-        "of points are those of a `LightCurve`.",
+        f"Argument `noise` must be a positive number or None, but it is {noise}: "
+        "errors of points are those of a `LightCurve`.",
     )
     for name in fitted:
         check_option("fitted", name, SCATTERING)
@@ -329,8 +331,8 @@ def _turns(span: float, shortest: float, longest: float) -> tuple[float, float]:
     """Fewest and most turns within the span."""
     demand(
         0 < shortest <= longest,
-        "Arguments `shortest` and `longest` must be periods in seconds in rising order, "
-        f"but they are {shortest} and {longest}.",
+        "Arguments `shortest` and `longest` must be periods in seconds in rising "
+        f"order, but they are {shortest} and {longest}.",
     )
     check_span(span, shortest)
     turns = span / longest, span / shortest
@@ -370,7 +372,7 @@ def _residuals(
 def _left(
     spins: Spins, surface: Surface, readings: Readings
 ) -> Float[np.ndarray, " epochs"]:
-    """What the best solution leaves, over the noise."""
+    """Residuals of the best solution, over the noise."""
     best = _residuals(spins.numbers[0], spins.frames[0], surface, readings)
     return np.asarray(best)
 
@@ -419,8 +421,8 @@ def _inversion(
 def _with_spread(minima: list[Spin], scale: float) -> Spin:
     """The best of the minima about a pole, with errors that hold the others.
 
-    They are root mean square distances from it in a mixture of normal distributions, one
-    about each minimum.
+    They are root mean square distances from it in a mixture of normal distributions,
+    one about each minimum.
     """
     lowest = min(minima, key=lambda spin: spin.chi_square)
     growth = np.array([(x.chi_square - lowest.chi_square) / scale for x in minima])
@@ -444,7 +446,7 @@ def _with_spread(minima: list[Spin], scale: float) -> Spin:
 
 
 def _index_of_mirror(spins: Spins) -> int | None:
-    """Which solution is the mirror of the first one, if one is."""
+    """Index of the solution that is the mirror of the first one, or None."""
     poles = spins.poles()
     # Half a turn about the third axis of space.
     apart = np.linalg.norm(poles - poles[0] * [-1.0, -1.0, 1.0], axis=1)
@@ -483,7 +485,7 @@ def _estimates_and_slopes(
 
 
 def _estimates(vector: Array, frame: Matrix, span: Array) -> SpinEstimates:
-    """What observers quote."""
+    """Quantities that observers quote, from the vector of numbers."""
     numbers = unpacked_convex(vector, SPIN)
     pole = product("ij,i->j", frame, axes_of_momentum(numbers.motion[1:])[2])
     law = law_of(numbers.scattering)
@@ -545,7 +547,7 @@ def _report(found: SpinInversion) -> str:
 
 
 def _verdict(found: SpinInversion) -> str:
-    """What the table says, in a sentence."""
+    """A sentence that sums up the table."""
     count = len(found.solutions)
     value = (
         f"chi-square over {found.degrees_of_freedom} degrees of freedom is "
@@ -554,8 +556,8 @@ def _verdict(found: SpinInversion) -> str:
     )
     if not found.follows:
         return (
-            "No steady rotation was found that follows the light curves to their noise: "
-            f"{value}, and residuals at neighbouring points correlate by "
+            "No steady rotation was found that follows the light curves to their "
+            f"noise: {value}, and residuals at neighbouring points correlate by "
             f"{found.correlation:.2f}. The body tumbles or is far from convex, its "
             "period is out of the range, `scattering` is another law, `degree` or "
             "`facets` are too few, or a stated noise is too small."
@@ -563,13 +565,13 @@ def _verdict(found: SpinInversion) -> str:
     if count == 1:
         return f"One steady rotation explains the light curves: {value}."
     return (
-        f"{count} steady rotations explain the light curves, which do not say which one "
-        f"is true: {value}."
+        f"{count} steady rotations explain the light curves, which do not say which "
+        f"one is true: {value}."
     )
 
 
 def _of_mirror(found: SpinInversion) -> str:
-    """What is known of the mirror solution, in a sentence."""
+    """A sentence about the mirror solution."""
     mirror = found.mirror
     if mirror is None:
         return "The mirror solution, with the pole's other longitude, is no minimum."
@@ -583,8 +585,8 @@ def _of_mirror(found: SpinInversion) -> str:
     pole = in_degrees(mirror.estimates.longitude, mirror.errors.longitude)
     latitude = in_degrees(mirror.estimates.latitude, mirror.errors.latitude)
     return (
-        f"The mirror of 1, with its pole at longitude {pole}, latitude {latitude}, has a "
-        f"chi-square that is larger by {grown:.0f}."
+        f"The mirror of 1, with its pole at longitude {pole}, latitude {latitude}, has "
+        f"a chi-square that is larger by {grown:.0f}."
     )
 
 
@@ -604,7 +606,7 @@ def _described(head: str, spin: Spin) -> list[str]:
 def of_surface(
     x: Any, error: Any, open_share: float, shape: Facets | Ellipsoid
 ) -> list[str]:
-    """What was found of a surface, in words.
+    """Lines of text that describe a surface that was found.
 
     Args:
         x: Estimates, with `scattering` and `albedo`.

@@ -1,4 +1,4 @@
-"""Where a body and the Earth are: Kepler orbits about the Sun, on the host."""
+"""Positions of a body and the Earth: Kepler orbits about the Sun, on the host."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -22,7 +22,8 @@ _DAY = 86400.0  # s
 _J2000 = 2451545.0
 _CENTURY = 36525.0  # days
 # Elements of the Earth-Moon barycentre at J2000 and their rates a century: semi-major
-# axis [au], eccentricity, and inclination, mean longitude, longitude of perihelion [deg].
+# axis [au], eccentricity, and inclination, mean longitude, longitude of perihelion
+# [deg].
 _EARTH = np.array(
     [
         [1.00000261, 0.00000562],
@@ -173,8 +174,8 @@ def geometry_of_orbit(orbit: Orbit) -> Positions:
 
     Returns:
         A function of the Julian dates of observation at the Earth. It returns vectors
-        from the body to the Sun and to the Earth [m], in the ecliptic of J2000. The body
-        is where it was when the light left it.
+        from the body to the Sun and to the Earth [m], in the ecliptic of J2000. The
+        body is where it was when the light left it.
 
     >>> import numpy as np, jrigid as jr
     >>> orbit = jr.photometry.Orbit(3e11, 0.1, 0.0, 0.0, 0.0, 0.0, 2451545.0)
@@ -233,14 +234,14 @@ def geometry_of_table(
     vectors = [np.asarray(x, dtype=float) for x in (to_sun, to_observer)]
     demand(
         dates.ndim == 1 and dates.size >= 4 and bool(np.all(np.diff(dates) > 0)),
-        "Argument `julian_dates` must hold four dates or more that increase, but it does "
-        "not.",
+        "Argument `julian_dates` must hold four dates or more that increase, but it "
+        "does not.",
     )
     shape = (len(dates), 3)
     demand(
         all(x.shape == shape and bool(np.all(np.isfinite(x))) for x in vectors),
-        f"Arguments `to_sun` and `to_observer` must be finite and have the shape {shape}, "
-        "but they are not.",
+        "Arguments `to_sun` and `to_observer` must be finite and have the shape "
+        f"{shape}, but they are not.",
     )
     check_metres("to_sun", vectors[0])
     # Small numbers keep the digits of a time of day, which a Julian date loses.

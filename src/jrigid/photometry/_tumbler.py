@@ -26,7 +26,7 @@ MODES = ("short-axis", "long-axis", "principal-axis")
 
 
 def _converter(name: str, *shape: int) -> Callable[[Any], Array]:
-    """What makes an array of one shape of a field's value."""
+    """Function that makes an array of one shape from a field's value."""
     return lambda value: array_of_shape(name, value, shape)
 
 
@@ -52,8 +52,8 @@ class Tumbler(Readable):
 
     Raises:
         ValueError: A mode that does not exist, or an array of a wrong shape.
-        RuntimeError: The moments are not in rising order, or the pole is in degrees, and
-            they are known when the object is built.
+        RuntimeError: The moments are not in rising order, or the pole is in degrees,
+            and they are known when the object is built.
 
     >>> import jax.numpy as jnp, jrigid as jr
     >>> shape = jr.photometry.Ellipsoid(jnp.array([3.0, 2.0, 1.5]))

@@ -160,7 +160,7 @@ def poles_of(found: Found) -> Float[np.ndarray, "many 3"]:
 
 
 def index_of_mirror(readings: Readings, found: Found) -> int | None:
-    """Which point is the mirror of the first one, if one is."""
+    """Index of the point that is the mirror of the first one, or None."""
     poles = poles_of(found)
     mirrored = -poles[0] @ _reflection(readings)
     apart = np.linalg.norm(poles - mirrored, axis=1)
@@ -204,7 +204,7 @@ def _neighbours(candidates: np.ndarray, mode: Mode) -> np.ndarray:
 def _from_candidates(
     readings: Readings, candidates: np.ndarray, mode: Mode, choose: Choice
 ) -> list[Found]:
-    """What the chosen starting points of each candidate lead to, if there are any."""
+    """Refined points from chosen starting points of all candidates, if any exist."""
     numbers, of_candidate = _motions(candidates, mode)
     if len(numbers) == 0:
         return []
@@ -214,7 +214,7 @@ def _from_candidates(
 def _from_all_poles(
     readings: Readings, candidates: np.ndarray, mode: Mode
 ) -> list[Found]:
-    """What starting points at all poles lead to, for each candidate by itself."""
+    """Refined points from starting points at all poles, an entry for each candidate."""
     numbers, of_candidate = _motions(candidates, mode)
     if len(numbers) == 0:
         return []
@@ -348,7 +348,7 @@ def _refined(readings: Readings, starts: Found) -> Found:
 
 
 def _motions_of(found: Found) -> Float[np.ndarray, "many 3"]:
-    """What tells motions apart: their frequencies and their modes."""
+    """Frequencies and modes, which tell motions apart."""
     return np.column_stack([found.numbers[:, :2], found.tasks.mode])
 
 

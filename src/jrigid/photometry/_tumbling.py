@@ -104,9 +104,9 @@ def _tilts_and_energy(
 ) -> tuple[Float[Array, "2"], Scalar]:
     """Least and largest tilt, and E/E0, from the direction of the angular momentum.
 
-    With n a unit vector along it, 2 E / L^2 is the sum of n_i^2 / I_i. Excesses over the
-    energies of rotation about the two outer axes are sums of positive terms, so small
-    tilts keep their digits.
+    With n a unit vector along it, 2 E / L^2 is the sum of n_i^2 / I_i. Excesses over
+    the energies of rotation about the two outer axes are sums of positive terms, so
+    small tilts keep their digits.
     """
     principal = principal_axes(inertia)
     momentum = product("ij,i->j", principal.axes, angular_momentum(inertia, omega))
@@ -130,8 +130,8 @@ def _tilts_and_energy(
         ]
     )
     # The motion is about the smallest moment's axis where its energy is above that of
-    # rotation about the intermediate axis. The quotients do not show this if two moments are
-    # equal.
+    # rotation about the intermediate axis. The quotients do not show this if two
+    # moments are equal.
     long_axis = above > largest / middle - 1
     sines = jnp.clip(jnp.where(long_axis, about_smallest, about_largest), 0.0, 1.0)
     tilts = safe_arctan2(root_of_positive(sines), root_of_positive(1 - sines))
@@ -149,7 +149,7 @@ def omega_from_periods(
     rotation_period: ScalarLike,
     mode: str = "short-axis",
 ) -> Vector:
-    """Angular velocity of the free rotation with two given periods: `tumbling` reversed.
+    """Angular velocity of the free rotation with given periods: `tumbling` reversed.
 
     The ratio of the periods grows with the tilt, from that of a small wobble without
     bound at the separatrix, so there is one motion for each ratio and mode, but for its
@@ -174,7 +174,8 @@ def omega_from_periods(
     >>> import jax.numpy as jnp, jrigid as jr
     >>> toutatis = jnp.array([1.0, 3.09, 3.22])
     >>> day = 86400.0
-    >>> omega = jr.photometry.omega_from_periods(toutatis, 7.35 * day, 5.41 * day, "long-axis")
+    >>> omega = jr.photometry.omega_from_periods(
+    ...     toutatis, 7.35 * day, 5.41 * day, "long-axis")
     >>> print(jnp.rad2deg(jr.photometry.tumbling(toutatis, omega).tilt_max).round(1))
     51.2
     """
@@ -292,7 +293,7 @@ def _of_energy(
 
 
 def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
-    """Angular velocity for a unit angular momentum whose tilt has the tangent exp(y)."""
+    """Angular velocity for unit angular momentum whose tilt has the tangent exp(y)."""
     # The squares of sine and cosine are 1 / (1 + exp(-2 y)) and 1 / (1 + exp(2 y)):
     # neither is a difference, so that both keep their digits at all tilts.
     sine = jnp.sqrt(jax.nn.sigmoid(2 * y))
@@ -301,7 +302,7 @@ def _at_largest_tilt(moments: Vector, y: Scalar, long_axis: bool) -> Vector:
 
 
 def _of_tilt(moments: Vector, sine: Scalar, cosine: Scalar, long_axis: bool) -> Vector:
-    """Angular velocity for a unit angular momentum, from sine and cosine of its tilt."""
+    """Angular velocity for unit angular momentum, from sine and cosine of its tilt."""
     zero = jnp.zeros_like(sine)
     momentum = [cosine, sine, zero] if long_axis else [zero, sine, cosine]
     return jnp.stack(momentum) / moments

@@ -2,8 +2,9 @@ r"""The free motion of a tumbler, as Fourier series of one turn of the polhode.
 
 A fit of light curves evaluates thousands of motions at hundreds of epochs, and seeks
 their two frequencies rather than their angular velocity. This is the motion in these
-terms. With a unit angular momentum M in body axes, a_i = 1 / I_i, the axes named so that
-M circles the third and the second has the middle moment, and theta its largest tilt,
+terms. With a unit angular momentum M in body axes, a_i = 1 / I_i, the axes named so
+that M circles the third and the second has the middle moment, and theta its largest
+tilt,
 
     M1 = e sin(theta) sqrt(rho) k' sd(u),   rho = (a2 - a3) / (a1 - a3),
     M2 = sin(theta) cd(u),                  k'^2 = 1 / (1 + (1 - rho) tan(theta)^2),

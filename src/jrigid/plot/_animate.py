@@ -106,7 +106,7 @@ class Animation(NamedTuple):
         return page.replace("/* data */ null", json.dumps(data, separators=(",", ":")))
 
     def _repr_html_(self) -> str:
-        """For notebooks."""
+        """HTML for notebooks: the page in a frame."""
         # In a frame of its own the page keeps its styles and names apart from those
         # of the notebook.
         frame = (
@@ -269,7 +269,7 @@ def animate(
 
 
 def _number_of_frames(seconds: float, fps: float) -> int:
-    """How many frames a film has: two at least."""
+    """Number of frames of a film, two at least."""
     for name, value in (("seconds", seconds), ("fps", fps)):
         message = f"Argument `{name}` must be positive and finite, but it is {value!r}."
         demand(0 < value < np.inf, message)

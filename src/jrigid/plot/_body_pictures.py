@@ -31,7 +31,7 @@ _QUADS = np.array([int(x) for x in "013246750451237602641573"]).reshape(6, 4)
 
 
 class Surface(NamedTuple):
-    """What is drawn of a body, the farthest corner at 1.
+    """Surface that is drawn for a body, with its farthest corner at 1.
 
     Attributes:
         vertices: Corners, body components (n, 3).
@@ -205,7 +205,7 @@ def body(
 
 
 def _title(body: Body, kind: str) -> str:
-    """What is drawn, and its moments unless it is a mesh."""
+    """Title: what kind of body is drawn, and its moments unless it is a mesh."""
     if _is_mesh(body):
         return "Mesh"
     if isinstance(body, SymmetricTop):

@@ -28,7 +28,7 @@ _NARROW = 0.08  # of the shorter side of the map: regions without room for a nam
 
 @runtime_checkable
 class _DataArray(Protocol):
-    """What is used of xarray's, which is an extra."""
+    """Attributes that are used of xarray's `DataArray`; xarray is an extra."""
 
     dims: tuple[str, ...]
     coords: Mapping[str, Any]
@@ -57,7 +57,7 @@ class _Map(NamedTuple):
 
 
 class _Region(NamedTuple):
-    """Where a map has one value, or is on one side of a level."""
+    """Region in which a map has one value, or is on one side of a level."""
 
     name: str
     mask: np.ndarray
@@ -136,7 +136,7 @@ def chart(
 def _sides(
     values: np.ndarray, level: float | None, names: Sequence[str]
 ) -> list[_Region]:
-    """What is below and above a level, if there is one."""
+    """Regions below and above a level, if there is one."""
     # NaN is on neither side.
     masks = [] if level is None else [values <= level, values > level]
     needed = "must name what is below and above a `level`"

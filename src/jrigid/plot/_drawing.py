@@ -1,4 +1,4 @@
-"""What the pictures share: colours, axes, what a motion is, lines on a surface."""
+"""Parts that pictures share: colours, axes, states of motions, lines on a surface."""
 
 from collections.abc import Iterable, Iterator
 from itertools import cycle
@@ -61,7 +61,7 @@ class Rotating(Protocol):
 
 @runtime_checkable
 class HasStates(Protocol):
-    """What `simulate` and the exact motions return."""
+    """Object with states, as `simulate` and the exact motions return it."""
 
     states: Any
 

@@ -83,7 +83,7 @@ def fit(
 
 
 def _record(ax: Axes, result: FitResult, record: int, trial: int) -> None:
-    """What was read in a trial, and the model."""
+    """Draw the readings of a trial, and the model."""
     observations = result.observations(record)
     values = np.asarray(observations.values[trial])
     rows = np.any(np.isfinite(values), axis=1)
@@ -207,7 +207,7 @@ def _periodogram(
 
 
 def _range_of_means(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where 95 % of the means of so many powers of white noise are.
+    """Range that holds 95 % of the means of so many powers of white noise.
 
     These are Wilson and Hilferty's quantiles of chi-square over its degrees of freedom,
     of which a power has two. Source: Proc. Natl. Acad. Sci. 17 (1931) 684.

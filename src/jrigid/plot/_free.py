@@ -79,7 +79,7 @@ class _Momentum(NamedTuple):
 
     @classmethod
     def of(cls, body: Body, motion: Any) -> "_Momentum":
-        """Of angular velocities, or of a motion."""
+        """Angular momentum for angular velocities, or for a motion."""
         states = None if np.ndim(motion) else states_of(motion)
         omega = np.asarray(motion if states is None else states.omega, float)
         check_shape("motions", omega, (3,), (None, 3))

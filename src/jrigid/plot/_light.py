@@ -128,7 +128,7 @@ class _Stretches(NamedTuple):
 
 
 def _stretches_of(points: Points, tumbler: Tumbler) -> _Stretches:
-    """Where points are without a long gap."""
+    """Stretches of points without a long gap."""
     ts = points.ts
     cut = _CUT * float(tumbler.precession_period)
     after = np.flatnonzero(np.diff(ts) > cut)

@@ -1,4 +1,4 @@
-"""What the pictures of light curves share: a tumbler at times, and curves beside it."""
+"""Parts that pictures of light curves share: a tumbler at times, curves beside it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

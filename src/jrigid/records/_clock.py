@@ -225,7 +225,7 @@ def _evened(
 
 
 def _tick(pieces: list[np.ndarray]) -> tuple[float, bool]:
-    """What times are multiples of, 0 if of nothing; do most rows share their tick?"""
+    """Unit of which times are multiples, or 0, and whether most rows share a time."""
     steps = np.concatenate([np.diff(x) for x in pieces])
     if np.median(steps) == 0:
         return float(np.median(steps[steps > 0])), True

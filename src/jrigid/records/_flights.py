@@ -425,7 +425,7 @@ def _of_a_lever(
 
 
 def _at_the_end(forces: np.ndarray) -> np.ndarray:
-    """Where an accelerometer shows the end of its range: several times or never."""
+    """Samples at the end of an accelerometer's range; none unless there are several."""
     size = np.abs(np.nan_to_num(forces))
     at_end = size >= max((1 - 1e-6) * size.max(initial=0.0), _LEAST_RANGE)
     return at_end & (at_end.sum() >= _CLIPPED)
@@ -564,7 +564,7 @@ class _Equations(NamedTuple):
 
     @property
     def unknowns(self) -> int:
-        """How many numbers are sought."""
+        """Count of the numbers that are sought."""
         return self.law.model.shape[2]
 
     def solve(self, rows: slice | np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What is found in a record: rests, and the noise of the gyro at rest."""
+"""Rests that are found in a record, and the noise of the gyro at rest."""
 
 import itertools
 from typing import NamedTuple

@@ -83,7 +83,7 @@ class _Sensor(NamedTuple):
 
 
 class _Units(NamedTuple):
-    """What the caller `asked` for, and the notes on who says a unit."""
+    """Units that the caller `asked` for, and notes on who states each unit."""
 
     asked: dict[str, Unit]
     notes: list[str]
@@ -152,7 +152,7 @@ class _Units(NamedTuple):
 
 
 def _label(kind: str, sensor: _Sensor) -> str:
-    """What a note calls the columns of a sensor, or its column of times."""
+    """Name in notes of the columns of a sensor, or of its column of times."""
     return sensor.table.headers[sensor.columns[0]] if kind == "times" else sensor.label
 
 
@@ -308,7 +308,7 @@ def _in_si(
     times: np.ndarray,
     units: _Units,
 ) -> dict[str, np.ndarray]:
-    """What is measured, in SI; without that whose unit nobody says."""
+    """Measured values in SI, without those whose unit nobody states."""
     measured: dict[str, np.ndarray] = {}
     # The rates come last, because gravity may tell their unit.
     for kind in reversed(_MEASURED):
@@ -567,7 +567,7 @@ def _turned(times: np.ndarray, rates: np.ndarray, forces: np.ndarray) -> str:
 
 
 def _kind(name: str) -> str | None:
-    """What the words of a name say that is measured: a key of `_KINDS`."""
+    """Quantity that the words of a name state: a key of `_KINDS`, or None."""
     words = name.strip().lower()
     fits = (kind for kind, pattern in _KINDS.items() if re.search(pattern, words))
     return next(fits, None)

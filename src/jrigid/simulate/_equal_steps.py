@@ -31,7 +31,7 @@ def equal_steps(given: Prepared, options: Options) -> tuple[Engine, Motion]:
     limits = motion.limits
 
     def terms_of(t: Array, h: Array) -> Any:
-        """What the solver integrates in a step."""
+        """Terms that the solver integrates in a step."""
         if not isinstance(solver, Splitting):
             return FreeRotation(system.inertia.astype(motion.y0.dtype))
 

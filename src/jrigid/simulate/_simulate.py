@@ -327,7 +327,7 @@ def _by_diffrax(given: Prepared, options: Options) -> _Solved:
 
 
 def _reached(given: Prepared, end: Array) -> Array:
-    """Which output times a motion reached that ended at a time."""
+    """Whether a motion that ended at a time reached each output time."""
     times = jax.lax.stop_gradient(given.times)
     return (times <= jax.lax.stop_gradient(end)) & given.findings.ok
 

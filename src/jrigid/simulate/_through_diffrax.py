@@ -133,7 +133,7 @@ class _FirstChange(optx.AbstractRootFinder):
     norm: ClassVar[Callable[[PyTree], Array]] = optx.max_norm
 
     def init(self, *_: Any) -> Array:
-        """Not done."""
+        """Begin with the flag that says not done."""
         return jnp.array(False)
 
     def step(

@@ -13,6 +13,7 @@ from jrigid._numerics import product
 from jrigid._types import TimeLike
 from jrigid.solvers._dense import Dense
 
+# The tables are aligned by hand, with many numbers on a line.
 # fmt: off
 # Fractions of the step at which the stages are, from the second one on.
 _C = [

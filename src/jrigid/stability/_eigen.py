@@ -101,7 +101,7 @@ def _slopes(matrix: Array, values: Array, change: Array) -> Array:
 
 
 def _clusters(values: Array, distance: Array) -> Array:
-    """Which eigenvalues count as one; neighbours of neighbours belong together."""
+    """Whether pairs of eigenvalues count as one, directly or through others."""
     close = jnp.abs(values[:, None] - values[None, :]) <= distance
     # Each pass doubles the length of the chains that are joined.
     for _ in range(max(values.size - 1, 1).bit_length()):

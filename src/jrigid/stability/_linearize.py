@@ -194,16 +194,16 @@ class _Frame(NamedTuple):
         return jnp.concatenate([turning, change, inner])
 
     def look(self, later: Array) -> tuple[Array, Array]:
-        """What is linear about the motion some time later, and how it moves."""
+        """Matrix of the linearised motion some time later, and rates at zero."""
         still = jnp.zeros(self.motion.dimension, later.dtype)
         # The second one is passed through as a value, so one evaluation gives both.
         return jax.jacfwd(lambda x: (self.rates(x, later),) * 2, has_aux=True)(still)
 
     def symmetries(self, rate: Scalar) -> tuple[Array, Array]:
-        """Where every motion of a symmetric system may go, and slopes of what it keeps.
+        """Directions of a system's symmetries, and slopes of the conserved momenta.
 
-        It may turn about an axis in space, and about one in the body; it keeps its
-        momentum along.
+        Every motion of a symmetric system may turn about an axis in space, and about
+        one in the body. The angular momentum along each of them is conserved.
         """
         system, state, args, t0, *_ = self.motion
         own = self.own
@@ -242,7 +242,7 @@ class _Frame(NamedTuple):
 
 
 def _accuracy(dtype: Any) -> Scalar:
-    """What counts as zero beside the motion."""
+    """Size below which a number counts as zero beside the motion."""
     return 64 * jnp.sqrt(jnp.finfo(dtype).eps)
 
 

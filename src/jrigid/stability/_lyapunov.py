@@ -105,7 +105,7 @@ class Megno(NamedTuple):
 
 
 class _Schedule(NamedTuple):
-    """How the steps of a motion are divided."""
+    """Division of the steps of a motion."""
 
     samples: int
     intervals: int  # in each sample; the tangents are orthonormalised after each
@@ -161,7 +161,7 @@ def _starting_vectors(
 
 
 def _findings(motion: Motion, rows: Array, given: bool) -> Findings:
-    """What is wrong with the values of a motion and of its starting vectors."""
+    """Findings about the values of a motion and of its starting vectors."""
     findings = findings_of(motion)
     if given:
         rows = _scaled(walk(motion, 1, findings.ok), rows)

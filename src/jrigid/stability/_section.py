@@ -42,7 +42,7 @@ Condition = Callable[[Scalar, State], ScalarLike]
 
 
 class Section(NamedTuple):
-    """Where a motion crosses a surface.
+    """Points at which a motion crosses a surface.
 
     Attributes:
         states: States at the crossings; NaN beyond the last.
@@ -121,7 +121,7 @@ def poincare_section(
 
 
 def _section_findings(motion: Motion, condition: Condition) -> Findings:
-    """What is wrong with the arguments of a section."""
+    """Findings about the arguments of a section."""
     findings = findings_of(motion)
     with traced_by_jax("a condition"):
         value = jnp.asarray(condition(motion.t0, motion.state0))
@@ -137,7 +137,7 @@ def _section_findings(motion: Motion, condition: Condition) -> Findings:
 
 
 class _Position(NamedTuple):
-    """How far the search for crossings has come."""
+    """Progress of the search for crossings."""
 
     t: Array
     y: Array

@@ -66,7 +66,7 @@ def motion_of(
 
 
 def findings_of(motion: Motion) -> Findings:
-    """What is wrong with the values of the arguments."""
+    """Findings about the values of the arguments."""
     system, state0, args, t0, duration, _ = motion
     findings = Findings()
     message = "Argument `t0` must be finite, but it is not."
@@ -161,7 +161,10 @@ class Walk(NamedTuple):
 
         Such a solver is no explicit Runge-Kutta method.
         """
-        term = diffrax.ODETerm(lambda t, y, _: self._together(t, y))  # pyright: ignore
+        # diffrax types the time as any real scalar, and passes an array.
+        term = diffrax.ODETerm(
+            lambda t, y, _: self._together(t, y)  # pyright: ignore[reportArgumentType]
+        )
         solver = self.motion.solver
         end = t + self.step
         memory = solver.init(term, t, end, y, None)

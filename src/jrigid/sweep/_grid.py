@@ -40,7 +40,7 @@ class Grid(NamedTuple):
 
     @property
     def blocks(self) -> tuple[int, ...]:
-        """How many blocks there are along each axis."""
+        """Number of blocks along each axis."""
         return tuple(
             -(-n // width) for n, width in zip(self.shape, self.block, strict=True)
         )

@@ -1,7 +1,10 @@
 """A directory that keeps finished blocks: a zarr array for each value.
 
-A chunk holds a block. Chunks are written and checked here: zarr 3.1.6 takes 1 ms for
-each, this takes 0.1 ms, and all chunks are checked when a sweep is resumed.
+A chunk holds a block. Chunks are written and checked here, for two reasons. zarr 3.1.6
+takes 1 ms for each, this takes 0.1 ms, and all chunks are checked when a sweep is
+resumed. And whether a killed sweep can be resumed depends on how chunks are written: a
+rename gives a chunk its name once it is complete, and the mask of valid points is the
+last array of a block, so that a block with a mask is whole.
 """
 
 import contextlib
@@ -298,7 +301,7 @@ class Store:
         return self._chunk(VALID, number).exists()
 
     def count(self, number: int) -> int | None:
-        """How many valid points a block has; None if a chunk is lost or damaged."""
+        """Number of valid points of a block; None if a chunk is lost or damaged."""
         if not self.has(number):
             return None
         *values, valid = [self._read(leaf, number) for leaf in self.leaves]
@@ -413,7 +416,7 @@ class Store:
 
     @property
     def _new_description(self) -> Path:
-        """Where the description is written before it replaces the old one."""
+        """Path to which the description is written before it replaces the old one."""
         return self.path / "zarr.partial"
 
     def leave(self, _: int) -> None:

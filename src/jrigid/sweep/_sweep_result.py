@@ -48,6 +48,7 @@ class SweepResult(NamedTuple):
     valid: np.ndarray
     axes: dict[str, np.ndarray]
     failures: tuple[Failure, ...] = ()
+    # A named tuple has no factories of defaults, and nothing writes to this one.
     attributes: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     store: str | None = None
     classes: np.ndarray | None = None

@@ -1,4 +1,8 @@
-"""Compute a block, in this process or in one that receives the work as bytes."""
+"""Compute a block, in this process or in one that receives the work as bytes.
+
+A worker of a process pool ends itself when its driver ends (`end_with_driver`). If the
+driver is killed, `concurrent.futures` leaves its workers waiting for ever.
+"""
 
 import contextlib
 import functools
@@ -48,7 +52,7 @@ def under(values: tuple[Any, ...]) -> Generator[None, None, None]:
 
 
 class Work(NamedTuple):
-    """What a worker does with each block.
+    """Task of a worker, which is the same for each block.
 
     Attributes:
         function: Of a point, or of a number for each axis.
@@ -153,7 +157,7 @@ def in_words(error: BaseException) -> str:
 
 
 class Surroundings(NamedTuple):
-    """What a process needs before it imports or traces anything.
+    """Settings that a process needs before it imports or traces anything.
 
     Attributes:
         driver: Number of the process that hands out the blocks.

@@ -48,7 +48,7 @@ Shape = tuple[int | None, ...]
 
 
 class Rule(NamedTuple):
-    """What a parameter of a torque must be.
+    """Condition that a parameter of a torque must meet.
 
     Attributes:
         words: The rule in words.
@@ -97,7 +97,7 @@ NOT_ZERO = {"rule": Rule("finite and not zero", _finite_and_not_zero)}
 
 
 def _parameters_with_rules(module: eqx.Module) -> Iterator[tuple[str, Rule, Array]]:
-    """In words, the parameters of a module that have rules; the rules; the values."""
+    """Name in words, rule and value of each parameter of a module that has a rule."""
     for field in dataclasses.fields(module):
         value = getattr(module, field.name)
         # A parameter may also be a function of time, or None.

@@ -115,7 +115,7 @@ class GravityGradient(AbstractTorque):
     [ 0.     0.    -1.743]
     """
 
-    mu: Float[Array, ""] = eqx.field(converter=array("mu"), metadata=FINITE)
+    mu: Float[Array, ""] = eqx.field(converter=array("mu"), metadata=NOT_NEGATIVE)
     position: Callable[[ScalarLike], Vector] | None = None
     inertia: Float[Array, "..."] | None = None
 
