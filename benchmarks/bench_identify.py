@@ -92,14 +92,15 @@ def fits(values, ts, noise):
 def bound_at_truth(tensor, omega, ts, noise):
     """Covariance of the five numbers, and the relative bounds of the ratios."""
     plan = Plan(jr.RigidBody(tensor), jr.State(UNTURNED, omega), Rates(ts, None, noise))
-    unknowns, bound = plan.predicted.unknowns, plan.bound
-    numbers = jr.identify.parameters_from_inertia(tensor)[1:]
-    slopes = jax.jacfwd(lambda p: of_elements(unknowns.inertia(p)))(numbers)
+    predicted, bound = plan.predicted, plan.bound
+    tensor_of = predicted.unknowns.inertia
+    slopes = jax.jacfwd(lambda p: of_elements(tensor_of(p)))(predicted.numbers)
     moments = jnp.linalg.eigvalsh(tensor)
     relative = jnp.sqrt(jnp.diagonal(bound.ratios_covariance)) / (
         moments[1:] / moments[0]
     )
-    return slopes @ bound.covariance[:5, :5] @ slopes.T, jnp.max(relative)
+    of_numbers = bound.covariance[:5, :5]
+    return slopes @ of_numbers @ slopes.T, jnp.max(relative)
 
 
 def grid():

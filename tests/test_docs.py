@@ -26,7 +26,8 @@ PAGES = [
 
 # What takes long in CI; recipes are all run.
 LONG = re.compile(
-    r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate|photometry\.fit_shape\(",
+    r"jr\.identify\.(fit|optimal_trial)\(|optax.*jr\.simulate"
+    r"|photometry\.fit_shape\(|fit\.tumbler",
     re.DOTALL,
 )
 # What takes minutes to compile, in recipes too.

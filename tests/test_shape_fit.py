@@ -187,7 +187,7 @@ def test_a_noise_that_is_not_stated_does_not_hide_a_misfit(relative):
     wrong = ph.fit_shape(curves, slower, epoch=found.epoch, **SMALL)
     assert wrong.noise > 5 * NOISE
     assert not wrong.follows
-    assert "correlates by" in wrong.report()
+    assert "correlate by" in wrong.report()
 
 
 def test_mistakes_say_what_to_pass(relative):

@@ -28,8 +28,10 @@ _NEARLY_A_SPHERE = 1.03
 # Radians of a swing while the body turns by one: no free body does that.
 _TOO_FAST = 3.0
 _LOUD = 0.2  # part of the power that a swing has at its frequency
-# Periods of a swing in a record. The trend of a shorter one looks like a period of it.
-_FEWEST_PERIODS = 2
+# Degree of the polynomial that the rates of a body follow while it turns by 2 radians,
+# and part of their square that it may leave.
+_TREND = 2
+_NO_TREND = 0.03
 # Difference of chi-square within which two errors of a gyro explain about as much.
 _ABOUT_AS_MUCH = 16.0
 _OTHER_FIELD = 1.5  # times the size of a field: readings that are not of it
@@ -384,16 +386,27 @@ def _swing(result: FitResult) -> float:
     rates = np.asarray(samples.values[0])[trial][is_seen[trial]]
     if ts.size < _FEWEST:
         return 0.0
-    power = np.sum(np.abs(np.fft.rfft(rates - rates.mean(axis=0), axis=0)) ** 2, axis=1)
+    power = _spectrum(rates - rates.mean(axis=0))
     peak = int(np.argmax(power))
-    # In noise about a constant rate no frequency stands out.
-    if peak < _FEWEST_PERIODS or power[peak] < _LOUD * np.sum(power):
+    # The trend of a short record would look like one period as long as the record.
+    powers = np.vander(np.linspace(-1, 1, ts.size), _TREND + 1)
+    trend = powers @ np.linalg.lstsq(powers, rates)[0]
+    rest = _spectrum(rates - trend)
+    if np.sum(rest) < _NO_TREND * np.sum(power):
+        return 0.0
+    # In noise, about a constant rate or a trend, no frequency stands out.
+    if any(np.max(x) < _LOUD * np.sum(x) for x in (power, rest)):
         return 0.0
     # n samples stand for n steps, one more than lie between the first and the last. A
     # gap in the samples matters little beside a factor of 57.
     duration = float(ts[-1] - ts[0]) * ts.size / (ts.size - 1)
     size = math.sqrt(np.mean(np.sum(rates**2, axis=1)))
     return 2 * math.pi * peak / duration / size if size > 0 and duration > 0 else 0.0
+
+
+def _spectrum(rates: np.ndarray) -> np.ndarray:
+    """Power of rates (n, 3) at each frequency."""
+    return np.sum(np.abs(np.fft.rfft(rates, axis=0)) ** 2, axis=1)
 
 
 def _of_trials(result: FitResult) -> str:
