@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import jrigid as jr
 from jrigid import identify
-from jrigid.identify import Status, _fit
+from jrigid.identify import Status, _progress
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 TURN = Rotation.from_rotvec([0.6, -0.4, 0.9]).as_matrix()
@@ -1220,7 +1220,7 @@ def test_progress_is_shown_on_a_terminal_by_default(
 ):
     """In a bar if there is tqdm, else line by line."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr(_fit, "_PATIENCE", 0.0)
+    monkeypatch.setattr(_progress, "_PATIENCE", 0.0)
     if not with_tqdm:
         monkeypatch.setitem(sys.modules, "tqdm", None)
     _, omegas, _ = rates(ASYMMETRIC, SHORT)

@@ -1,11 +1,7 @@
 """fit(): estimates of inertia and other parameters from observations."""
 
-import contextlib
 import dataclasses
 import math
-import sys
-import threading
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -45,6 +41,7 @@ from jrigid.identify._layout import (
 )
 from jrigid.identify._minimise import Minimum, tensors_at
 from jrigid.identify._problem import Options, Problem, SimulatedWithParts
+from jrigid.identify._progress import reporter
 from jrigid.identify._quality import Fit
 from jrigid.identify._readings import (
     DirectReadings,
@@ -90,7 +87,6 @@ _STEPS = (4, 16, 64)  # of a segment, where one is too long for a torque
 # After so many turns the valley of the minimum is so narrow that probes go slowly, too.
 _MOST_JUMPS = 16  # of a torque in a segment at which steps may end
 _LONG = 60.0  # radians
-_PATIENCE = 2.0  # seconds without a sign of life
 
 
 def fit(
@@ -195,7 +191,7 @@ def fit(
         free, scale, inertia_model, unmodelled, loss, absolute_sigma, motion
     )
     task = _task(question, _Bodies(system), observations, start)
-    with _reporter(progress) as report:
+    with reporter(progress) as report:
         (fields,) = _fits([task], Effort(max_steps, doublings, report), throw)
     return result_of(fields)
 
@@ -290,67 +286,6 @@ def fit_each(
         "differ: call `fit` for each.",
     )
     return _side_by_side(_fits(tasks, Effort(max_steps, doublings), throw))
-
-
-@contextlib.contextmanager
-def _reporter(progress: bool | None) -> Iterator[Callable[[str], Any] | None]:
-    """Yield what is called with a line of text after each stage, or None.
-
-    It is a bar on a terminal where tqdm is installed.
-    """
-    if progress is not None or not sys.stderr.isatty():
-        yield print if progress else None
-        return
-    with contextlib.ExitStack() as stack:
-        try:
-            from tqdm import tqdm
-        except ModuleNotFoundError:
-            show, wait = _late_lines()
-        else:
-            # The number of stages is not known beforehand: the bar has no end.
-            bar = tqdm(
-                unit=" stages", delay=_PATIENCE, leave=False, mininterval=0, miniters=1
-            )
-            stack.enter_context(bar)
-            show, wait = _on_bar(bar)
-        # The first stage ends seconds after it began where its program is compiled.
-        timer = threading.Timer(_PATIENCE, wait, ["fit: compiles the first stage"])
-        timer.daemon = True
-        timer.start()
-        stack.callback(timer.cancel)
-
-        def show_stage(line: str) -> None:
-            timer.cancel()
-            show(line)
-
-        yield show_stage
-
-
-_Show = Callable[[str], None]
-
-
-def _on_bar(bar: Any) -> tuple[_Show, _Show]:
-    """Return functions that show a stage, and a text before the first one."""
-
-    def show(line: str) -> None:
-        bar.set_postfix_str(line, refresh=False)
-        bar.update()
-
-    return show, bar.set_postfix_str
-
-
-def _late_lines() -> tuple[_Show, _Show]:
-    """Return functions that print a stage after some seconds, and a text at once."""
-    start = time.perf_counter()
-
-    def wait(line: str) -> None:
-        print(line, file=sys.stderr)
-
-    def show(line: str) -> None:
-        if time.perf_counter() - start > _PATIENCE:
-            wait(line)
-
-    return show, wait
 
 
 class _Question(NamedTuple):
