@@ -11,24 +11,15 @@ import sys
 import math_core
 import nbformat
 from docutils import nodes
+from names import MODULES, TOP
 from PIL import Image
 from sphinx.transforms.post_transforms import SphinxPostTransform
 from sphinx.util.logging import getLogger
 from sphinx.util.nodes import make_refnode
 
-import jrigid
-
 ROOT = pathlib.Path(__file__).parents[1]
 API, THUMBNAILS = ROOT / "docs" / "api", ROOT / "docs" / "thumbnails"
 EXECUTED = ROOT / "outputs" / "notebooks"
-MODULES = {
-    f"jrigid.{name}": module
-    for name, module in inspect.getmembers(jrigid)
-    if inspect.ismodule(module) and hasattr(module, "__all__")
-}
-TOP = sorted(
-    k for k, x in inspect.getmembers(jrigid) if k[0] != "_" and not inspect.ismodule(x)
-)
 
 
 def home(name: str) -> str | None:

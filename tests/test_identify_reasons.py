@@ -134,7 +134,7 @@ def test_a_sigma_that_is_too_small_is_named_in_a_short_record(rng):
 
 @pytest.mark.parametrize("count", [30, 200])
 def test_a_sigma_that_hides_the_inertia_is_named(rng, count):
-    """A slow body: the noise as it is stated is larger than all rates but one."""
+    """A slow body, whose rates are about as large as the noise that is stated."""
     ts = np.arange(count) * 0.1
     values = solved(ts, [2.0, 0.7, 1.5])(ts).T + 0.01 * rng.normal(size=(count, 3))
     found = identify.fit(BLIND, identify.Rates(ts, values, 0.01), throw=False)

@@ -11,7 +11,7 @@ import numpy as np
 
 SURE = 5.5  # standard deviations: one white record in 5 x 10^7, for each band
 STRONG = 2.0  # times the mean power of the residuals
-_FEWEST = 16  # samples with a spectrum
+FEWEST = 16  # samples with a spectrum
 
 
 def stands_out(power: float, deviations: float) -> bool:
@@ -65,7 +65,7 @@ def _spectra(residuals: np.ndarray) -> list[tuple[np.ndarray, int]]:
     spectra = []
     for trial in residuals:
         observed = np.any(trial != 0, axis=-1)
-        if np.sum(observed) < _FEWEST:
+        if np.sum(observed) < FEWEST:
             continue
         # Removing gaps keeps white noise white.
         rows = trial[observed][:, np.any(trial != 0, axis=0)]

@@ -32,8 +32,8 @@ _COST = 4.0
 # each number, where it has numbers of its own. Few trials do not show which of them it
 # is, nor do trials of which many seem to have another body.
 _FOREIGN = 30.0
-_FEWEST = 5
-_MOST_FOREIGN = 0.25
+FEWEST_TRIALS = 5
+MOST_FOREIGN = 0.25  # of all trials
 # Sizes of the torque in trials are known beforehand to within a factor exp(0.7).
 _PRECISION_OF_SIZES = 1 / 0.7**2
 
@@ -377,7 +377,7 @@ class Search:
         used = np.any(fit.kept > 0, axis=1)
         none = np.zeros(used.shape, bool)
         numbers = fit.minimum.point.numbers.size
-        if np.sum(used) < _FEWEST or not numbers:
+        if np.sum(used) < FEWEST_TRIALS or not numbers:
             return none
         fall = Likelihood(fit).as_of_another_body(torque)
         # Under a torque that is not quite of this form all trials differ.
@@ -385,7 +385,7 @@ class Search:
         # In a trial of the same body the fall is about chi-square of as many degrees of
         # freedom as there are numbers.
         foreign = used & (fall > usual * (numbers + _FOREIGN))
-        most = used.size * _MOST_FOREIGN
+        most = used.size * MOST_FOREIGN
         return foreign if np.sum(foreign | ~used) <= most else none
 
     def covariance(self, torque: Torque, fit: Fit) -> np.ndarray:

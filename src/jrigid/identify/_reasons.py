@@ -7,12 +7,14 @@ that is not sought, or something that swings.
 import math
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from jrigid._checks import RESULTS
 from jrigid.identify import _conventions as conventions
-from jrigid.identify._colour import stands_out
+from jrigid.identify._colour import FEWEST, stands_out
 from jrigid.identify._gyro_errors import GyroErrors
 from jrigid.identify._inertia_models import AbstractInertiaModel, Flat, Moments, Tensor
+from jrigid.identify._levels import FEWEST_TRIALS, MOST_FOREIGN
 from jrigid.identify._quality import GATE
 from jrigid.identify._resolution import UNRESOLVED
 from jrigid.identify._result import FitResult, Status
@@ -38,12 +40,8 @@ _OTHER_FIELD = 1.5  # times the size of a field: readings that are not of it
 _MUCH_LEFT = 0.05  # of the square of a record, by a fit that follows it
 CORRELATED = 0.1  # correlation of neighbours
 SURELY_CORRELATED = 5.0  # standard deviations of that
-_FEWEST = 16  # samples whose spectrum says something
-# Trials with so many times the chi-square of the others may be of another body. Few
-# trials do not show it, nor do trials of which many differ.
+# Trials with so many times the chi-square of the others may be of another body.
 _FAR_ABOVE_OTHERS = 5.0
-_FEWEST_TRIALS = 5
-_MOST_STRANGE = 0.25
 # Readings at the largest value of an axis that show a limit: so many, and so many times
 # as many as at the next value, since coarse readings repeat theirs.
 _AT_LIMIT = 8
@@ -88,8 +86,7 @@ def _reason(result: FitResult) -> str:
             "The body does not turn: the readings are no larger than their noise. "
             "Inertia shows in rates that change."
         )
-    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
-    if failed and _is_steady(result):
+    if _failed(result) and _is_steady(result):
         return (
             "The rates do not change by more than their noise: those of a spin about "
             "one axis, or of a sphere, say nothing of the inertia."
@@ -127,6 +124,11 @@ def _reason(result: FitResult) -> str:
             filter(None, [_of_scale(result), _of_noise(result), _of_minimum(result)])
         )
     )
+
+
+def _failed(result: FitResult) -> bool:
+    """Whether the fit does not follow the record."""
+    return result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
 
 
 def _readings_of(result: FitResult) -> list[tuple[AbstractSensor, np.ndarray]]:
@@ -180,9 +182,9 @@ def _of_scale(result: FitResult) -> str:
     """A sentence about a tensor whose trace was held beside a torque of known size."""
     options = result.problem.options
     unknowns = result.unknowns
-    is_held = not (unknowns.scaled or unknowns.inertia_model.absolute)
-    is_sought = any(x.name.startswith("torque") for x in unknowns.sought)
-    if result.status == Status.OK or options.free_motion or is_sought or not is_held:
+    if result.status == Status.OK or options.free_motion:
+        return ""
+    if unknowns.has_scale or unknowns.seeks_torque:
         return ""
     return (
         "The trace of the tensor is held at that of the body which was given. If it "
@@ -192,7 +194,6 @@ def _of_scale(result: FitResult) -> str:
 
 def _of_minimum(result: FitResult) -> str:
     """Advice where the search may have ended in a wrong minimum."""
-    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
     is_misfit = result.status == Status.MISFIT
     unexplained = float(result.diagnostics.unexplained)
     sentences = []
@@ -203,7 +204,7 @@ def _of_minimum(result: FitResult) -> str:
         )
     # Where rates or attitudes are read, they show where the search begins.
     is_seen = any(isinstance(x, Gyro | AttitudeSensor) for x in result.fitted()[1:])
-    if (failed or is_misfit) and not is_seen:
+    if (_failed(result) or is_misfit) and not is_seen:
         sentences.append(
             "No sensor reads rates or attitudes, so that the search depends on where "
             "it begins: pass a tensor and a state (`start`), or first fit a part of "
@@ -384,13 +385,13 @@ def _swing(result: FitResult) -> float:
     trial = int(np.argmax(np.sum(is_seen, axis=1)))
     ts = np.asarray(samples.ts)[trial, part][is_seen[trial]]
     rates = np.asarray(samples.values[0])[trial][is_seen[trial]]
-    if ts.size < _FEWEST:
+    if ts.size < FEWEST:
         return 0.0
     power = _spectrum(rates - rates.mean(axis=0))
     peak = int(np.argmax(power))
     # The trend of a short record would look like one period as long as the record.
-    powers = np.vander(np.linspace(-1, 1, ts.size), _TREND + 1)
-    trend = powers @ np.linalg.lstsq(powers, rates)[0]
+    at = np.linspace(-1, 1, ts.size)
+    trend = polynomial.polyval(at, polynomial.polyfit(at, rates, _TREND)).T
     rest = _spectrum(rates - trend)
     if np.sum(rest) < _NO_TREND * np.sum(power):
         return 0.0
@@ -413,11 +414,11 @@ def _of_trials(result: FitResult) -> str:
     """A sentence about a few trials with far larger residuals than the others."""
     by_trial = np.asarray(result.diagnostics.chi_square_by_trial, float)
     takes_part = ~np.asarray(result.rejected_trials)
-    if np.sum(takes_part) < _FEWEST_TRIALS:
+    if np.sum(takes_part) < FEWEST_TRIALS:
         return ""
     usual = float(np.median(by_trial[takes_part]))
     large = takes_part & (by_trial > _FAR_ABOVE_OTHERS * usual)
-    if not 0 < np.sum(large) <= _MOST_STRANGE * by_trial.size:
+    if not 0 < np.sum(large) <= MOST_FOREIGN * by_trial.size:
         return ""
     least = float(np.min(by_trial[large])) / usual
     names = ", ".join(map(str, np.flatnonzero(large)))
@@ -441,24 +442,22 @@ def _of_noise(result: FitResult) -> str:
     # A plan has no residuals.
     if 0 < square < 1 - chance:
         return f"{residuals}: {_too_large(result)}"
-    is_misfit = result.status == Status.MISFIT
     band, sure = (float(x) for x in result.diagnostics.loudest_band)
     like, deviations = result.diagnostics.whiteness
     is_coloured = like > CORRELATED and deviations > SURELY_CORRELATED
-    failed = result.status in (Status.WRONG_BASIN, Status.NOT_CONVERGED)
-    if (
-        failed
-        and not is_coloured
-        and not stands_out(band, sure)
-        and square > 1 + chance
-    ):
-        return f"{residuals}, and white: {_too_small(result)}"
-    if not is_misfit:
+    has_band = stands_out(band, sure)
+    is_large = square > 1 + chance
+    if _failed(result):
+        # Residuals of a wrong minimum have a colour, which says nothing of the record.
+        is_white = not (is_coloured or has_band)
+        too_small = f"{residuals}, and white: {_too_small(result)}"
+        return too_small if is_white and is_large else ""
+    if result.status != Status.MISFIT:
         return ""
     of_trials = _of_trials(result)
     if of_trials:
         return of_trials
-    if stands_out(band, sure):
+    if has_band:
         return (
             f"The residuals have {band:.2g} times their mean power in one band of "
             "frequencies: something that changes slowly, or swings, is missing. See "
@@ -469,7 +468,7 @@ def _of_noise(result: FitResult) -> str:
             f"{residuals}, and neighbours correlate by {like:.2f}: see `unmodelled` "
             "and `free`."
         )
-    if square > 1 + chance:
+    if is_large:
         return f"{residuals}, and white: {_too_small(result)}"
     if len(result.kept) == 1:
         return ""

@@ -415,6 +415,16 @@ class Unknowns(eqx.Module):
         return dict(zip(sizes, one_after_another(sizes.values()), strict=True))
 
     @property
+    def has_scale(self) -> bool:
+        """Whether the scale of the tensor is sought, or set by the inertia model."""
+        return self.scaled or self.inertia_model.absolute
+
+    @property
+    def seeks_torque(self) -> bool:
+        """Whether an array of the torque is sought."""
+        return any(x.name.startswith("torque") for x in self.sought)
+
+    @property
     def of_inertia(self) -> slice:
         """Position of the numbers of the tensor."""
         return slice(self.slices["scale"].stop)

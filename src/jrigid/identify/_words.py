@@ -87,12 +87,13 @@ def _undetermined_scale(result: FitResult) -> list[str]:
     """The overall scale, where nothing sets it."""
     unknowns = result.unknowns
     free_motion = result.problem.options.free_motion
-    driven = any(x.name.startswith("torque") for x in unknowns.sought)
-    if unknowns.scaled or unknowns.inertia_model.absolute:
+    if unknowns.has_scale:
         return []
     if free_motion:
         return ["overall scale"]
-    return ["overall scale, which what is sought of the torque follows"] * driven
+    if unknowns.seeks_torque:
+        return ["overall scale, which what is sought of the torque follows"]
+    return []
 
 
 def _undetermined_numbers(result: FitResult) -> list[str]:
@@ -280,8 +281,7 @@ def _with_errors(
 def _of_tensor(result: FitResult) -> list[str]:
     """Ratios, moments and axes."""
     model = result.unknowns.inertia_model
-    is_scaled = result.unknowns.scaled or model.absolute
-    unit = " kg m^2" if is_scaled else " (trace as declared)"
+    unit = " kg m^2" if result.unknowns.has_scale else " (trace as declared)"
     errors = np.sqrt(np.diagonal(np.asarray(result.moments_covariance)))
     lines = [
         "  ratios   I2/I1 = "
